@@ -53,6 +53,7 @@ def _hand_over_to_petsc(words: list[str]) -> None:
     first_option = next(
         (i for i, word in enumerate(words) if word.startswith(PETSC_PREFIXES)), len(words)
     )
+    # a word of the program behind them would be lost
     for word in words[first_option:]:
         if word.startswith("--") or word.endswith((".yaml", ".yml")):
             sys.exit(
@@ -87,7 +88,8 @@ def main() -> None:
     # PETSc's signal handler would report a crash
     os.environ["PETSC_OPTIONS"] = f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"
     _hand_over_to_petsc(sys.argv)
-    # a small run looks for no garbage; Python's own would do so two hundred times
+    # with these thresholds a small run collects no garbage; with Python's own ones it would do so
+    # two hundred times
     gc.set_threshold(300_000, 5, 5)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`
     try:
@@ -170,7 +172,7 @@ def run(
     }
     with exit_codes():
         read = open_case(case, world(), set_ or [])
-    # what solves: a refused case does without
+    # a refused case does not import what solves
     from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line

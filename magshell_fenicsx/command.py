@@ -57,7 +57,7 @@ class Commands(typer.Typer):
 def case_files(incomplete: str) -> list[str]:
     """Return case files with this beginning, here or one folder deeper.
 
-    Without any, the shell offers its own files.
+    If there are none, the shell of the command line completes file names itself.
     """
     begin = escape(incomplete)
     files = glob(f"{begin}*.yaml") + glob(f"{begin}*/*.yaml")  # noqa: PTH207 - a Path would lose the ./ that was typed
@@ -176,7 +176,7 @@ def picture_options(
     CaseError
         If a camera or a range cannot be read.
     """
-    # at the end what was not given is left out, so that the case's own options stay
+    # what is not given is None, and left out at the end: there the case's own options stay
     keys: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
     keys["formats"] = formats.split(",") if formats else None
     if camera:
@@ -251,9 +251,9 @@ def _all_fail(comm: Any) -> bool:
 
     other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
     deadline = time.monotonic() + MAX_DELAY_OF_ERRORS
-    for rank in other_ranks:  # one byte: that this rank fails
+    for rank in other_ranks:  # a message of one byte says that this rank fails
         comm.Isend(bytearray(1), rank, FAILURE_TAG)
-    # no collective: others may be in one
+    # single messages, no collective call: the other ranks may wait in another collective call
     requests = [comm.Irecv(bytearray(1), rank, FAILURE_TAG) for rank in other_ranks]
     while not MPI.Request.Testall(requests):
         if time.monotonic() > deadline:

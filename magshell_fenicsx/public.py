@@ -75,7 +75,7 @@ class Scene(SceneOfProblem):
     Parameters
     ----------
     case
-        A problem, or what makes one; see `problem_of`.
+        A problem, or a case, a mapping like a case file, or the path of a file.
     comm
         The processes; by default those of the mesh that a program gave, or all.
     plan
@@ -120,9 +120,16 @@ def follow(
 ) -> Iterator[Record]:
     """Compute the history of a scene, or of a problem or what makes one.
 
-    It yields every accepted point.
-    A problem on a mesh of a program is solved by the processes of that mesh. For all else see
-    `simulate.follow.follow`.
+    It yields every accepted point. A problem on a mesh of a program is solved by the processes of
+    that mesh.
+
+    Parameters
+    ----------
+    search
+        Whether steps search for further solutions where the case asks for that.
+    remark
+        Called with sentences without which the result must not be read; by default they are
+        warnings.
     """
     scene = given if isinstance(given, SceneOfProblem) else Scene(given)
     return follow_scene(scene, search=search, remark=remark)
@@ -171,7 +178,19 @@ def identify(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
 ) -> "Identified":
-    """Find numbers of a case file from measured data; see `studies.identify.identify`."""
+    """Find numbers of a case file from measured data, as `studies.identify.identify` does.
+
+    Parameters
+    ----------
+    file, data
+        The case file, which says which numbers are searched for, and a CSV file with the data.
+    settings
+        Texts "KEY=VALUE" that replace keys of the case.
+    out
+        Folder of the results.
+    say
+        Function that prints a line of text.
+    """
     from magshell_fenicsx.studies.identify import identify as identify_parameters
 
     return identify_parameters(
@@ -206,7 +225,7 @@ def run(  # noqa: PLR0913 - what a user gives
     Parameters
     ----------
     case
-        A problem, or what makes one; see `problem_of`.
+        A problem, or a case, a mapping like a case file, or the path of a file.
     out
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
     comm

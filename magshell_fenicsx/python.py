@@ -83,6 +83,17 @@ class Shell:
         On every rank, if the mesh is of another kind, or tags are missing.
     CaseError
         If a geometry or a key is none that a shell has, or `unit` seems to be forgotten.
+
+    Attributes
+    ----------
+    user_mesh
+        The dolfinx mesh; None of a geometry.
+    files
+        Store of the triangles of the mesh, which take the place of a file.
+    _keys
+        Keys of the section `shell` of a case, with their values.
+    _member_keys
+        Keys that only one of several shells may have; None for those that are not given.
     """
 
     def __init__(  # noqa: PLR0913 - what a user gives
@@ -110,24 +121,20 @@ class Shell:
         geometry = surface if isinstance(surface, str) else "mesh"
         if geometry not in SHAPES:
             raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
-        # names that are arguments here rather than keys of a case
+        # names that are arguments here rather than keys of a case are known as well
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
         refuse_unknown(
             keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._member_keys, *of_mesh)
         )
         if isinstance(surface, str):
-            mesh_keys = {
-                "edges": edges,
-                "patches": patches,
-                "facet_tags": facet_tags,
-                "cell_tags": cell_tags,
-                "unit": unit,
-            }
-            unfit = next((key for key, value in mesh_keys.items() if value is not None), None)
-            if unfit:
-                raise CaseError(
-                    f"{NAME}: shell.{unfit}: is of a mesh; a {surface} has its own edges"
-                )
+            _refuse_mesh_keys(
+                surface,
+                edges=edges,
+                patches=patches,
+                facet_tags=facet_tags,
+                cell_tags=cell_tags,
+                unit=unit,
+            )
             self._keys |= {"geometry": surface}
             return
         if unfit := next((key for key in ("geometry", "file") if key in keys), None):
@@ -137,6 +144,7 @@ class Shell:
         # the case names a file, which is never read: its content is given
         self.files.given[Path(MESH).absolute()] = triangles
         self._keys |= {"geometry": "mesh", "file": MESH}
+        # without any unit all lengths are plain numbers; a mesh without its own unit is in metres
         has_units = isinstance(keys.get("thickness"), str)
         if has_units or unit is not None:
             self._keys["unit"] = unit or "m"
@@ -250,7 +258,8 @@ def Section(key: str, **keys: Any) -> ProblemPart:
     annotation = Case.model_fields[key].annotation
     types = [member for member in (annotation, *get_args(annotation)) if isinstance(member, type)]
     sections = [member for member in types if issubclass(member, BaseModel)]
-    if len(sections) == 1:  # others are lists, and names with sections
+    # lists, and mappings of names to sections, have no keys that could be checked here
+    if len(sections) == 1:
         refuse_unknown(keys, sections[0], f"{NAME}: {key}")
     return ProblemPart(key, lambda shell: shell.plain_value(keys, key))
 
@@ -361,6 +370,21 @@ def Field(
         return section
 
     return ProblemPart("magnetic", magnetic_keys)
+
+
+def _refuse_mesh_keys(geometry: str, **mesh_keys: Any) -> None:
+    """Refuse arguments that only a mesh may have, beside the name of a geometry.
+
+    `mesh_keys` are the arguments by name; None stands for one that is not given.
+
+    Raises
+    ------
+    CaseError
+        With the first argument that is given.
+    """
+    unfit = next((key for key, value in mesh_keys.items() if value is not None), None)
+    if unfit:
+        raise CaseError(f"{NAME}: shell.{unfit}: is of a mesh; a {geometry} has its own edges")
 
 
 def _refuse_metres(
@@ -633,4 +657,5 @@ def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
         shell.user_field(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
         for p in term.parameters
     )
-    return replace(term, parameters=parameters) if term.varying else term
+    has_functions = term.varying
+    return replace(term, parameters=parameters) if has_functions else term

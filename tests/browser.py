@@ -45,7 +45,7 @@ class Page:
         return self._browser.ask(method, self, self._session, **parameters)
 
     def open(self, file: Path, width: int, height: int = 900) -> None:
-        """Open a file in a window of so many pixels, and wait until the page says that it is ready."""
+        """Open a file in a window of so many pixels. Wait until the page says it is ready."""
         self.errors.clear()
         self.resize(width, height)
         self._ask("Page.navigate", url=file.resolve().as_uri())

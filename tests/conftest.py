@@ -44,7 +44,8 @@ mesh: {degree: 3, refinement: 0.5}
 loading: {kind: pressure, until: limit}
 """  # in units, with a dimple, in a field
 STRIP = """
-shell: {geometry: strip, radius: 17.2 mm, width: 0.29, thickness: 0.84 mm, youngs_modulus: 900 kPa, poisson_ratio: 0.49}
+shell: {geometry: strip, radius: 17.2 mm, width: 0.29, thickness: 0.84 mm, \
+youngs_modulus: 900 kPa, poisson_ratio: 0.49}
 boundary: {root: clamped}
 points: {tip: [17.2 mm, 0 mm, 0 mm]}
 magnetic:

@@ -53,7 +53,10 @@ if __name__ == "__main__":
                     else ""
                 )
                 print(
-                    f"{lambda_m:+.5f} {degree:6} {refinement:9} {cells:9} {dofs:9} {e:+12.1e} {order:>9}",
+                    (
+                        f"{lambda_m:+.5f} {degree:6} {refinement:9} {cells:9} {dofs:9} "
+                        f"{e:+12.1e} {order:>9}"
+                    ),
                     flush=True,
                 )
                 last = cells, e

@@ -1,4 +1,4 @@
-"""What the pages say is there: links, files, places in the code, cases, commands and their options."""
+"""What the pages say is there: links, files, places in the code, cases, commands, options."""
 
 import ast
 import re
@@ -85,7 +85,7 @@ def test_places_in_the_code() -> None:
 
 
 def test_places_that_docstrings_name() -> None:
-    """Of three names or more with dots, such as `mesh.mirror.rotation`, the first that of a folder."""
+    """Of three names or more with dots, such as `mesh.mirror.rotation`, the first a folder's."""
     package, gone = TOP / "magshell_fenicsx", list[str]()
     for file in package.rglob("*.py"):
         for name in re.findall(r"`(\w+(?:\.\w+){2,})`", text(file)):
@@ -112,7 +112,7 @@ CASE_BLOCKS = [(page, block) for page in PAGES for block in blocks(page, "yaml")
     ids=[f"{page.stem}{i}" for i, (page, _) in enumerate(CASE_BLOCKS)],
 )
 def test_yaml_is_a_case_that_can_be_built(page: Path, block: str, tmp_path: Path) -> None:
-    """And so is what stands behind a key as another value of it, `# key: {...}`, alone on its line."""
+    """So is what stands behind a key as another value of it, `# key: {...}`, alone on its line."""
     (tmp_path / "case.yaml").write_text(block, encoding="utf-8")
     others = re.findall(r"^# (\w+): (\{.*?\}|\w+)(?:\s+#.*)?$", block, re.MULTILINE)
     for setting in ["", *(f"{key}={value}" for key, value in others)]:
@@ -217,7 +217,7 @@ def test_messages_of_the_page_are_in_the_code() -> None:
 
 
 def test_messages_of_the_code_are_on_the_page() -> None:
-    """What is raised for a user, or said as a warning, but for what only passes on another message."""
+    """What is raised for a user or said as a warning, unless it only passes on another message."""
     raised = {
         words(said(node.exc.args[0]))
         for node in nodes()

@@ -1,4 +1,4 @@
-"""Mutated case files: each is refused with a message, or works; none ends in a traceback or hangs."""
+"""Mutated case files are refused with a message, or work. None ends in a traceback or hangs."""
 
 import time
 import traceback
@@ -107,7 +107,10 @@ ABSURD = [
     ("shell.youngs_modulus=9**9**9 Pa", "not a number with a unit"),
     ("magnetic={lambda_m: 1e-300}", "allowed are 0 and"),
     (
-        "magnetic={lambda_m: 1, remanent: {kind: expression, components: ['1/x', '0', '9**9**9**9']}}",
+        (
+            "magnetic={lambda_m: 1, remanent: {kind: expression, "
+            "components: ['1/x', '0', '9**9**9**9']}}"
+        ),
         "no finite value",
     ),
     (

@@ -63,7 +63,10 @@ class Built:
     wheel: Path
 
 
-BACKEND = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+BACKEND = (
+    "import sys; from setuptools import build_meta; "
+    "print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+)
 
 
 def built(kind: str, source: Path, to: Path) -> Path:
@@ -135,7 +138,7 @@ def test_what_is_published(archives: Built) -> None:
 
 @pytest.mark.slow
 def test_what_is_installed(installed: Installed) -> None:
-    """The code with its template, C source and marker of types, and of cases/ the examples alone."""
+    """The code with template, C source and marker of types. Of cases/ the examples alone."""
     package = Path(installed.python("import magshell_fenicsx; print(magshell_fenicsx.__path__[0])"))
     assert package.is_relative_to(installed.bin.parent)
     for file in ("py.typed", "assembly/scatter.c", "output/report/report_template.html"):

@@ -44,7 +44,10 @@ SCENES = {
             "--set=mesh.degree=2",
             "--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45, azimuth: 90}}",
             *LAW,
-            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.1, points: 1}",
+            (
+                "--set=loading={kind: pressure, control: load, until: target, "
+                "pressure: 0.1, points: 1}"
+            ),
         ],
     ),
 }
@@ -54,12 +57,21 @@ SCENES |= {
         [
             *COARSER,
             "--set=mesh.degree=2",
-            "--set=loading=[{kind: field, points: 1}, {kind: source, move: [0, 0, 20 mm], points: 1}]",
+            (
+                "--set=loading=[{kind: field, points: 1}, "
+                "{kind: source, move: [0, 0, 20 mm], points: 1}]"
+            ),
         ],
     ),
 }
-SOFT = "magnetic={susceptibility: 2 + x, remanent: {polar: 90, flux_density: 3 mT}, applied: {sources: [%s]}}"
-NEAR = "{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.3 T, position: [40 mm, 0, -60 mm]}"
+SOFT = (
+    "magnetic={susceptibility: 2 + x, remanent: {polar: 90, flux_density: 3 mT}, "
+    "applied: {sources: [%s]}}"
+)
+NEAR = (
+    "{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.3 T, "
+    "position: [40 mm, 0, -60 mm]}"
+)
 SCENES |= {
     "half shell, soft beside a magnet": (
         "magnet_strip.yaml",
@@ -87,7 +99,10 @@ SCENES |= {
     "a mesh with a fold and two patches": (
         "bracket.yaml",
         [
-            "--set=magnetic={lambda_m: 1e-6, remanent: {kind: patches, patches: {shelf: {polar: 90}}}}",
+            (
+                "--set=magnetic={lambda_m: 1e-6, remanent: {kind: patches, "
+                "patches: {shelf: {polar: 90}}}}"
+            ),
             "--set=shell.thickness_factor={flange: 2}",
             "--set=mesh.degree=2",
         ],
@@ -96,7 +111,8 @@ SCENES |= {
         "benchmarks/pinched_cylinder.yaml",
         [
             *ROOF,
-            "--set=shell={geometry: cylinder, radius: 100, length: 100, thickness: 2, youngs_modulus: 30.0e3, "
+            "--set=shell={geometry: cylinder, radius: 100, length: 100, thickness: 2, "
+            "youngs_modulus: 30.0e3, "
             "poisson_ratio: 0.3, thickness_factor: '1 + z/2'}",
             "--set=boundary={top: clamped}",
             "--set=mesh.size=40",
@@ -105,10 +121,14 @@ SCENES |= {
     "a dimple across the seam of a cylinder": (
         "pole_indentation.yaml",
         [
-            "--set=shell={geometry: cylinder, radius: 100, length: 100, thickness: 2, poisson_ratio: 0.3, "
+            "--set=shell={geometry: cylinder, radius: 100, length: 100, thickness: 2, "
+            "poisson_ratio: 0.3, "
             "imperfections: [{kind: dimple, amplitude: 1, width: 3, at: {point: [100, 0, 50]}}]}",
             "--set=boundary={bottom: clamped, top: clamped}",
-            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.1, points: 2}",
+            (
+                "--set=loading={kind: pressure, control: load, until: target, "
+                "pressure: 0.1, points: 2}"
+            ),
             "--set=symmetry=none",
             "--set=mesh={degree: 2, refinement: 0.4}",
         ],
@@ -116,10 +136,16 @@ SCENES |= {
     "a tube open to a pressure": (
         "benchmarks/pinched_cylinder.yaml",
         [
-            "--set=shell={geometry: cylinder, radius: 1, length: 1, thickness: 0.05, poisson_ratio: 0.3}",
+            (
+                "--set=shell={geometry: cylinder, radius: 1, length: 1, thickness: 0.05, "
+                "poisson_ratio: 0.3}"
+            ),
             "--set=boundary={bottom: clamped}",
             "--set=points={A: [1, 0, 1]}",
-            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.05, points: 1}",
+            (
+                "--set=loading={kind: pressure, control: load, until: target, "
+                "pressure: 0.05, points: 1}"
+            ),
             "--set=mesh={degree: 2, size: 0.4}",
             "--set=symmetry=none",
         ],
@@ -136,7 +162,10 @@ SCENES |= {
         ],
     ),
 }
-MOVES = "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, -1, 0], angle: 10, point: [1, 0, 0]}}]"
+MOVES = (
+    "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, -1, 0], angle: 10, "
+    "point: [1, 0, 0]}}]"
+)
 SCENES |= {
     "a natural shape": (
         "natural_strip.yaml",

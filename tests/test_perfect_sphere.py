@@ -29,7 +29,10 @@ def scene(symmetry: str, R_over_h: float, **mesh: Any) -> Scene:
 
 
 def waves_of(found: Scene, vector: np.ndarray) -> int:
-    """The number of waves that fits the normal displacement best on the circle where it is largest."""
+    """The number of waves that fits the normal displacement best.
+
+    This is on the circle where it is largest.
+    """
     surface = gatherer(found.model, found.comm).gather(vector)
     assert surface is not None
     theta = np.arctan2(surface.r0[:, 1], surface.r0[:, 0])

@@ -80,14 +80,16 @@ def main() -> None:
         if name != "step":
             snap = [RATE * crossing(each, SNAPPED) for each in (ours, theirs)]
             print(
-                f"{name}: {SNAPPED:g} mm at {snap[0]:.3f} mT, measured {snap[1]:.3f} mT ({snap[0] / snap[1] - 1:+.1%})"
+                f"{name}: {SNAPPED:g} mm at {snap[0]:.3f} mT, measured {snap[1]:.3f} mT "
+                f"({snap[0] / snap[1] - 1:+.1%})"
             )
         after, last = (0.9, 1.2) if name == "ramp" else (0.0, 0.5)
         if name != "triangle":
             for who, each in (("computed", ours), ("measured", theirs)):
                 period, ratio = ringing(each, after, last)
                 print(
-                    f"{name}, {who}: largest {each[:, 1].max():.3f} mm, period {period:.4f} s, ratio {ratio:.3f}"
+                    f"{name}, {who}: largest {each[:, 1].max():.3f} mm, "
+                    f"period {period:.4f} s, ratio {ratio:.3f}"
                 )
         axes.plot(*theirs.T, ".", color="C1", markersize=3.5, label="measured")
         axes.plot(*ours.T, color="C0", linewidth=1, label="computed")

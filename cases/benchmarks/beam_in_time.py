@@ -176,7 +176,8 @@ def main() -> None:
     asked = parser.parse_args()
     times, w = deflections(asked.elements, asked.tolerance)
     print(
-        f"snaps at {snapped(times, w):.5f}, ends at {w[-1] / h:.4f} h; {time.process_time():.2f} s of CPU"
+        f"snaps at {snapped(times, w):.5f}, ends at {w[-1] / h:.4f} h; "
+        f"{time.process_time():.2f} s of CPU"
     )
 
 

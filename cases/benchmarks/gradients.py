@@ -185,7 +185,8 @@ def _differences(
 def main(names: Sequence[str]) -> None:
     for name in names or CASES:
         print(
-            f"\n### {name}\n\n{CASES[name].account}\n\n| key | result | gradient | difference of runs | error |"
+            f"\n### {name}\n\n{CASES[name].account}\n\n"
+            "| key | result | gradient | difference of runs | error |"
         )
         print("| --- | --- | --- | --- | --- |")
         refused = list[Line]()

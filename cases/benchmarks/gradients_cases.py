@@ -103,8 +103,10 @@ magnetic:
         polarization: 0.5 T
         position: [35 mm, 0, -18 mm]
       - {kind: coil, diameter: 40 mm, current: 20 A, turns: 30}
-      - {kind: coil, vertices: [[0, 0, 9 mm], [20 mm, 0, 12 mm], [10 mm, 12 mm, 15 mm], [0, 0, 9 mm]], current: 300 A}
-      - {kind: formula, components: [0.1*z, 0.2*y, 1 + 0.1*x - 0.3*z], flux_density: 3 mT, position: [5 mm, 0, 0]}
+      - {kind: coil, vertices: [[0, 0, 9 mm], [20 mm, 0, 12 mm], [10 mm, 12 mm, 15 mm], \
+[0, 0, 9 mm]], current: 300 A}
+      - {kind: formula, components: [0.1*z, 0.2*y, 1 + 0.1*x - 0.3*z], flux_density: 3 mT, \
+position: [5 mm, 0, 0]}
 loading: {kind: field, points: 1}
 """
 CAP = """
@@ -124,7 +126,8 @@ foundation: {stiffness: 5 kPa/mm}
 magnetic:
   remanent: {flux_density: 80 mT}
   applied:
-    sources: [{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.2 T, position: [0, 0, -15 mm]}]
+    sources: [{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.2 T, \
+position: [0, 0, -15 mm]}]
 """
 
 
@@ -165,7 +168,8 @@ magnetic: {remanent: {flux_density: 60 mT}, applied: {flux_density: 15 mT}}
 LAYERS = """
 magnetic:
   lambda_m: 3.0e-5
-  remanent: {kind: layers, layers: [{polar: 60, fraction: 0.4}, {polar: 100, azimuth: 30, fraction: 0.6}]}
+  remanent: {kind: layers, layers: [{polar: 60, fraction: 0.4}, \
+{polar: 100, azimuth: 30, fraction: 0.6}]}
   applied: {polar: 20}
 """
 PATCHES = """
@@ -176,7 +180,8 @@ shell:
   defect: {kind: dimple, amplitude: 1.2, width: 3}
 boundary: {equator: clamped}
 points: {A: [0, 0, 1]}
-magnetic: {lambda_m: 0.001, remanent: {kind: patches, patches: {dimple: {polar: 0}, rest: {polar: 180}}}, applied: {}}
+magnetic: {lambda_m: 0.001, remanent: {kind: patches, \
+patches: {dimple: {polar: 0}, rest: {polar: 180}}}, applied: {}}
 natural: {curvature: {dimple: [0.3, 0.2, 0.0], rest: 0.1}}
 loading: {kind: pressure, control: load, until: target, pressure: 0.2, points: 1}
 """
@@ -197,7 +202,10 @@ loading:
 """
 CASES = {
     "strip in a field": Compared(
-        "A strip with two imperfections, an oblique natural shape, a remanence, and a field with a gradient.",
+        (
+            "A strip with two imperfections, an oblique natural shape, a remanence, "
+            "and a field with a gradient."
+        ),
         FLAWED
         + HELD
         + IN_FIELD
@@ -251,7 +259,10 @@ loading:
     ),
     "layers": Compared("Layers of a thickness.", STRIP + HELD + LAYERS, ("energy", "tip_uz")),
     "ball": Compared(
-        "A cap on springs above a magnet, under a ball: a meridian, where what is not symmetric is refused.",
+        (
+            "A cap on springs above a magnet, under a ball: a meridian, "
+            "where what is not symmetric is refused."
+        ),
         pressed("kind: sphere, radius: 8 mm, at: {polar: 0}"),
         ("energy", "A_uz", "force"),
     ),
@@ -262,7 +273,8 @@ loading:
     "ellipsoid": Compared(
         "A strip under an ellipsoid that stands obliquely.",
         pressed_strip(
-            "kind: ellipsoid, semi_axes: [6 mm, 4 mm, 5 mm], axis: [1.0, 0.5, 0.0], position: [20 mm, 1 mm, 6 mm], "
+            "kind: ellipsoid, semi_axes: [6 mm, 4 mm, 5 mm], axis: [1.0, 0.5, 0.0], "
+            "position: [20 mm, 1 mm, 6 mm], "
             "direction: [0.1, 0.0, -1.0]"
         ),
         ("tip_uz", "force"),
@@ -278,7 +290,8 @@ loading:
     "box": Compared(
         "A strip under a box.",
         pressed_strip(
-            "kind: box, size: [6 mm, 5 mm, 4 mm], edge: 1 mm, axis: [1.0, 0.3, 0.0], at: {point: [20 mm, 1 mm, 0]}"
+            "kind: box, size: [6 mm, 5 mm, 4 mm], edge: 1 mm, axis: [1.0, 0.3, 0.0], "
+            "at: {point: [20 mm, 1 mm, 0]}"
         ),
         ("tip_uz", "force"),
     ),

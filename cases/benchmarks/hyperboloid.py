@@ -36,24 +36,37 @@ LAYER, GROWTH = 4.0, 2.0  # over the size: of the cells in a layer over √h, an
 M = 2  # waves of the load around the axis
 TEXT = """# A hyperboloid, thinner and thinner
 
-Lee and Bathe's hyperboloid of revolution, r² = 1 + z² (-1 ≤ z ≤ 1, ν = 1/3), under a dead pressure p cos 2θ, in the
-linear regime. With clamped edges the membrane carries the load, with free edges bending does: the strain energy U of
-the whole shell is of the order p²/(E h) and p²/(E h³). `python3 -m benchmarks.hyperboloid` writes this page.
+Lee and Bathe's hyperboloid of revolution, r² = 1 + z² (-1 ≤ z ≤ 1, ν = 1/3), \
+under a dead pressure p cos 2θ, in the
+linear regime. With clamped edges the membrane carries the load, with free edges bending does: \
+the strain energy U of
+the whole shell is of the order p²/(E h) and p²/(E h³). \
+`python3 -m benchmarks.hyperboloid` writes this page.
 
 The **reference** is another discretisation: the second variation of waves cos 2θ on the meridian
-(`shells/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the
-difference from half as many. **error** is the relative error of U on triangles (an eighth of the shell, degree 4),
-**order** that of the last two meshes in the size of the elements, where it is above the reference's error.
+(`shells/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; \
+**its error** is the
+difference from half as many. **error** is the relative error of U on triangles \
+(an eighth of the shell, degree 4),
+**order** that of the last two meshes in the size of the elements, \
+where it is above the reference's error.
 
 - Both energies tend to a number as h falls, as the theory has it.
-- Clamped edges have layers of the width √h. On meshes with cells of 4 √h times the size there, which grow away from
-  the edge, the error is the same for thick and thin shells, with the order 6 to 7: no locking. Uniform meshes do not
+- Clamped edges have layers of the width √h. On meshes with cells of 4 √h times the size there, \
+which grow away from
+  the edge, the error is the same for thick and thin shells, with the order 6 to 7: no locking. \
+Uniform meshes do not
   resolve the layer at R/h = 10 000, 0.01 wide; the error is below 2 %, but the order is lost.
-- Free edges: the shell bends without stretching, and the element, which has displacements alone, locks on coarse
-  meshes: on one mesh the error grows with R/h. It is no layer that is missed, as the last table shows: with equally
-  many unknowns the error falls with the degree, for thin shells most. Degree 2 is useless for thin shells, 3 has 4 %
-  on the finer mesh at R/h = 10 000, 4 has 6e-4 and 5 has 5e-6. Locking becomes weak with the degree, and disappears
-  at none: **ratio**, the error at R/h = 10 000 over that at 100, is still 270 at degree 5 (27 on the finer mesh, where
+- Free edges: the shell bends without stretching, and the element, which has displacements alone, \
+locks on coarse
+  meshes: on one mesh the error grows with R/h. It is no layer that is missed, \
+as the last table shows: with equally
+  many unknowns the error falls with the degree, for thin shells most. \
+Degree 2 is useless for thin shells, 3 has 4 %
+  on the finer mesh at R/h = 10 000, 4 has 6e-4 and 5 has 5e-6. \
+Locking becomes weak with the degree, and disappears
+  at none: **ratio**, the error at R/h = 10 000 over that at 100, \
+is still 270 at degree 5 (27 on the finer mesh, where
   the reference's error counts).
 
 """
@@ -174,7 +187,10 @@ def main() -> None:
             "order",
         ]
         mesh = {"clamped": ", graded meshes" if graded else ", uniform meshes", "free": ""}[edge]
-        text += f"## {edge.capitalize()} edges{mesh}\n\n| R/h | {' | '.join(head)} |\n{'| --- ' * (len(head) + 1)}|\n"
+        text += (
+            f"## {edge.capitalize()} edges{mesh}\n\n| R/h | {' | '.join(head)} |\n"
+            f"{'| --- ' * (len(head) + 1)}|\n"
+        )
         text += "\n".join(rows(edge, thin, sizes, graded=graded)) + "\n\n"  # type: ignore[arg-type]
     names = (
         "| degree | size | "

@@ -193,7 +193,7 @@ def measured(obstacle: Obstacle, refinement: float) -> tuple[Line, list[dict[str
 
 
 def finished(case: Case, folder: Path) -> tuple[dict[str, Any], list[dict[str, str]]]:
-    """Summary and path of a case, run unless its folder has it already, computed by these sources."""
+    """Summary and path of a case. It runs, unless its folder has a run by these sources."""
     with suppress(AlreadyComplete):
         try:
             run(

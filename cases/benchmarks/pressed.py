@@ -45,11 +45,14 @@ def cases(size: str) -> dict[str, dict[str, Any]]:
     return {
         "plate": {
             "shell": DOME, "boundary": CLAMPED, "bodies": {"plate": {"kind": "plane"}}, **mesh,
-            "loading": {"kind": "contact", "control": "approach", "approach": f"{DEPTH} mm", "points": 2},
+            "loading": {"kind": "contact", "control": "approach", "approach": f"{DEPTH} mm",
+                        "points": 2},
         },
         "shell": {
-            "shells": {"dome": {"shell": DOME, "boundary": CLAMPED}, "plate": plate}, "contact": [["dome", "plate"]],
-            **mesh, "loading": {"kind": "edge", "control": "load", "factor": 1, "points": 2, "moves": [down]},
+            "shells": {"dome": {"shell": DOME, "boundary": CLAMPED}, "plate": plate},
+            "contact": [["dome", "plate"]], **mesh,
+            "loading": {"kind": "edge", "control": "load", "factor": 1, "points": 2,
+                        "moves": [down]},
         },
     }  # fmt: skip
 

@@ -90,7 +90,7 @@ def passing(one: Array, other: Array) -> NDArray[np.bool_]:
 
 
 def distances(one: Array, other: Array) -> Array:
-    """Of two triangles (n, 3, 3) that do not pass through each other, without sides of no length."""
+    """Of two triangles (n, 3, 3) that do not pass through each other, each side of some length."""
     least = np.full(len(one), np.inf)
     for i, j in product(range(3), range(3)):  # two sides
         p, q, d, e = (
@@ -360,7 +360,10 @@ def pushes(seeds: Sequence[int], table: Path) -> Iterator[Push]:
 
 def counts(done: Sequence[Push]) -> Iterator[str]:
     """A table of Markdown: a row for each kind."""
-    yield "| | pushes | target | fold | failed | points | touching | smallest gap | intersections | CPU s |"
+    yield (
+        "| | pushes | target | fold | failed | points | touching | smallest gap | "
+        "intersections | CPU s |"
+    )
     yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
     for kind in ("sheet", "disc"):
         of = [each for each in done if each.kind == kind]

@@ -232,7 +232,8 @@ def outcome(result: Result) -> str:
         return f"no result: the undeformed shell has {undeformed} unstable directions"
     met = ", ".join(
         f"{point['mode'] + ' ' if point['mode'].startswith('m') else ''}{point['kind']} at "
-        f"{'p/p_c' if point['amplitude'] == 'pressure' else point['amplitude']} = {point['value']:.5g}"
+        f"{'p/p_c' if point['amplitude'] == 'pressure' else point['amplitude']} = "
+        f"{point['value']:.5g}"
         for point in result.limit_points
     )
     said = f"stopped: {result.stopped}" if result.stopped else "reached"

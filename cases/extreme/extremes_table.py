@@ -8,15 +8,20 @@ from magshell_fenicsx.output.store.table import write_csv
 
 INTRO = """# Extremes
 
-What becomes of shells far from the ordinary ones: `make extremes` runs every case of `cases/extreme/` in the variants
+What becomes of shells far from the ordinary ones: `make extremes` runs every case of \
+`cases/extreme/` in the variants
 below and writes this table and `extremes.csv`.
 
-- **outcome**: *reached* what the case asked for, or *stopped* and why; then the instabilities on the way.
-- **value**: of the first instability (for `inside_out` of the first fold in the force), or the displacement at the end
-  (tip over length for `slivers`, pole over thickness for `nothing`). **error** is against an independent solution or,
+- **outcome**: *reached* what the case asked for, or *stopped* and why; \
+then the instabilities on the way.
+- **value**: of the first instability (for `inside_out` of the first fold in the force), \
+or the displacement at the end
+  (tip over length for `slivers`, pole over thickness for `nothing`). \
+**error** is against an independent solution or,
   in *italics*, against our own at degree 5 on a mesh twice as fine.
 - **smallest step**: the least motion of the pole over h between two accepted points.
-- **condition**: largest over smallest |eigenvalue| of the tangent, of the undeformed shell and at the last point; at a
+- **condition**: largest over smallest |eigenvalue| of the tangent, \
+of the undeformed shell and at the last point; at a
   fold or bifurcation the latter has no bound but rounding.
 
 """

@@ -112,7 +112,7 @@ def make(name: str, out: Path = OUT) -> Sweep:
 
 
 def knockdowns(done: Sweep) -> list[dict[str, Any]]:
-    """A row for every point with a field: k_d, and its change from the same shell without a field."""
+    """A row for every point with a field: k_d, and its change from the shell without a field."""
     pairs = list(zip(done.points, done.outcomes, strict=True))
     none = next(o.knockdown for p, o in pairs if not p.case.lambda_m)
     rows = []

@@ -40,7 +40,8 @@ OVER = {  # cases of magshell boundary -> the keys that vary
 THUMB = 110  # pixels of a picture in the table at the head
 HEAD = """# Gallery
 
-Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
+Every case of `cases/`, which `magshell example NAME` writes too. \
+CPU time is of the whole process with all files, on
 one core of a shared machine, kernels compiled. Made by `make gallery`.
 """
 
@@ -83,7 +84,8 @@ def row(file: Path) -> str:
         raise SystemExit(f"{file.name}: no picture: {said.stderr.strip() or last}")
     _shrink(shots[0], OUT / f"{file.stem}.png")
     return (
-        f"## {file.stem}\n\n{title(file)}.\n\n![{title(file)}]({file.stem}.png)\n\n    {' '.join(command)}\n\n"
+        f"## {file.stem}\n\n{title(file)}.\n\n![{title(file)}]({file.stem}.png)\n\n"
+        f"    {' '.join(command)}\n\n"
         f"{last.removesuffix('.')}.{end} CPU time: {cpu:.0f} s.\n"
     )
 

@@ -25,9 +25,12 @@ LOCATED = "fold", "bifurcation"
 FLOOR = 1e-8  # relative: an instability is located to this where its own estimate is smaller
 HEAD = """# All cases under noise
 
-Relative noise of 1e-15, 1e-14 and 1e-13 in residual and tangent, in turn, each evaluation with other numbers
-(`cases/noise/table.py`). *Instabilities* counts the seeds with the same instabilities, of the same kinds, in the same
-order; *load* is the largest deviation of their loads over the sum of both estimated errors, *u* that of the
+Relative noise of 1e-15, 1e-14 and 1e-13 in residual and tangent, in turn, \
+each evaluation with other numbers
+(`cases/noise/table.py`). *Instabilities* counts the seeds with the same instabilities, \
+of the same kinds, in the same
+order; *load* is the largest deviation of their loads over the sum of both estimated errors, \
+*u* that of the
 displacements at the points asked for.
 
 | case | seeds | same end | same instabilities | load | u |

@@ -1,4 +1,4 @@
-"""What the measured numbers say: ratios within one benchmark, against an earlier one, and a table."""
+"""What the measured numbers say: ratios in one benchmark, against an earlier one, and a table."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -77,7 +77,8 @@ def compare(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
             f"old: {describe_machine(old['machine'])}",
         ]
         lines.append(
-            f"Not the same machine or versions: times are divided by their median ratio {scale:.3g}."
+            "Not the same machine or versions: times are divided by their median ratio "
+            f"{scale:.3g}."
         )
     for (name, key), ratio in ratios.items():
         ratio /= scale if key.endswith("_s") else 1.0
@@ -97,4 +98,7 @@ def table(found: Mapping[str, Any]) -> str:
         lines.append([name, *values])
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     ratios = "\n".join(f"- {name}: {value:.3g}" for name, value in found["derived"].items())
-    return f"# Numbers of the benchmark\n\nMedians on {describe_machine(found['machine'])}.\n\n{rows}\n\n{ratios}\n"
+    return (
+        f"# Numbers of the benchmark\n\nMedians on {describe_machine(found['machine'])}.\n\n"
+        f"{rows}\n\n{ratios}\n"
+    )

@@ -40,7 +40,8 @@ def row(refinement: float, degree: int, ranks: int, repeats: int) -> Row:
     used = measure("speed.workload", arguments, ranks, WITH_CAMPAIGNS)
     if used.code:
         raise ScaleFailed(
-            f"refinement {refinement:g} on {ranks} ranks: exit code {used.code}: {used.errors.strip()}"
+            f"refinement {refinement:g} on {ranks} ranks: exit code {used.code}: "
+            f"{used.errors.strip()}"
         )
     found = json.loads(
         next(line for line in used.output.splitlines() if line.startswith("{"))

@@ -45,7 +45,7 @@ HEIGHT = 1e-4  # over h; every term contributes, and the tangent is positive def
 
 
 def measured(scene: Scene, repeats: int) -> dict[str, float]:
-    """Medians over iterations after the first, which also computes the ordering and the sparsity."""
+    """Medians over iterations after the first, which also finds the ordering and the sparsity."""
     model, factorisation, comm = scene.model, scene.newton.factorisation, scene.comm
     system = model.system
     r0 = model.r0.x.array[: system.size].reshape(-1, 3)

@@ -8,6 +8,7 @@ W is a density, an energy per area as a function of vectors z_i at a point: a fi
 derivatives (`shape_tables`). Its Hessian consists of (3, 3) blocks for pairs i, j of vectors,
 stored as a symmetric part of six components and a skew part of three. An entity is a cell or an
 edge; an edge has one or two sides, its cells. Local edges of a triangle are numbered 0 to 2.
+`degree` is the degree of a quadrature.
 """
 
 from collections.abc import Iterator
@@ -112,9 +113,11 @@ def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -
     mask
         (local cells,): an edge counts with one of its cells; None: all edges.
     """
-    cells, edges, reversed_edges = interior_edges(V)
-    kinds = np.column_stack([edges, reversed_edges.astype(np.int32)])
-    return list(_edge_batches(V, degree, *_masked(cells, kinds, mask)))
+    cells, edges, are_opposite = interior_edges(V)
+    # edges of one kind have the same local numbers and the same relative orientation
+    kinds = np.column_stack([edges, are_opposite.astype(np.int32)])
+    counted_cells, counted_kinds = _masked(cells, kinds, mask)
+    return list(_edge_batches(V, degree, counted_cells, counted_kinds))
 
 
 def boundary_batches(
@@ -129,13 +132,23 @@ def boundary_batches(
     mask
         (local cells,): an edge counts with its cell; None: all edges.
     """
-    return list(_edge_batches(V, degree, *_masked(*boundary_edges(V, facets), mask)))
+    cells, edges = boundary_edges(V, facets)  # an edge's kind is its local number alone
+    counted_cells, counted_kinds = _masked(cells, edges, mask)
+    return list(_edge_batches(V, degree, counted_cells, counted_kinds))
 
 
 def _masked(
     cells: NDArray[np.int32], kinds: NDArray[np.int32], mask: CellMask
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the rows of cells and kinds (n, ...) of edges with at least one counted cell."""
+    """Return the cells and the kinds of those edges that have at least one counted cell.
+
+    Parameters
+    ----------
+    cells, kinds
+        (n, sides): the cells of each edge; (n, ...): the numbers that make edges of one kind.
+    mask
+        (local cells,): which cells count; None: all.
+    """
     rows = slice(None) if mask is None else mask[cells].any(axis=1)
     return cells[rows], kinds[rows]
 
@@ -161,7 +174,7 @@ def interior_edges(
     first_positions = cells_of_edges.offsets[facets]
     cells = cells_of_edges.array[first_positions[:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
-    # two cells run in opposite directions if they start at different vertices
+    # two cells run in opposite directions if the edge starts at different vertices in them
     first_starts, second_starts = (_corner(V, cells[:, side], edges[:, side]) for side in range(2))
     return cells, edges, first_starts != second_starts
 
@@ -192,7 +205,7 @@ def boundary_edges(
 def _edge_batches(
     V: fem.FunctionSpace, degree: int, cells: NDArray[np.int32], kinds: NDArray[np.int32]
 ) -> Iterator[EntityBatch]:
-    """Iterate over batches of edges of the same kind.
+    """Iterate over batches of edges, each of one kind: all its edges share the quadrature points.
 
     Parameters
     ----------
@@ -314,10 +327,11 @@ def _triangle_areas(places: Array) -> Array:
 class Contraction:
     """The contraction K[ac, bd] = sum over points and pairs i, j of w D_i[a] D_j[b] H[ic, jd].
 
-    D_i are the shape functions' derivatives, H the Hessians at points; a and b count functions, c
-    and d components. Products of two D are the same for all entities of a rule. For a symmetric
-    (skew) block they are symmetric (skew) in a, b, so only a <= b is computed. The private fields
-    `_symmetric` and `_skew` have these products for each side, and `_cross` between the sides.
+    w are the weights. D_i are the derivatives of the shape functions, in the order of the vectors
+    z_i, H the Hessians at points; a and b count functions, c and d components. Products of two D
+    are the same for all entities of a rule. For a symmetric (skew) block they are symmetric (skew)
+    in a, b, so only a <= b is computed. The private fields `_symmetric` and `_skew` have these
+    products for each side, and `_cross` between the sides, as arrays (points * pairs, functions).
 
     Parameters
     ----------
@@ -349,6 +363,7 @@ class Contraction:
             (entities, 9, pairs a <= b): six symmetric components, then three skew ones.
         """
         symmetric = self._symmetric[side]
+        # (entities, components, pairs of functions)
         K = np.zeros((len(blocks.skew[side]), 9, symmetric.shape[1]))
         K[:, :6] = _product(blocks.symmetric[side], symmetric)
         if self._skew:
@@ -399,10 +414,11 @@ class HessianBlocks:
         """
         values *= factor
         first_column = 0
+        # each array of blocks, the pairs of all terms in it, and the pairs that this term has
         for target, all_pairs, term_pairs in self._targets(pairs):
             entities, components, points, _ = target.shape
             end_column = first_column + components * len(term_pairs)
-            # each target has consecutive columns of the values
+            # the blocks for this array are consecutive columns of the values
             block = values[:, first_column:end_column].reshape(
                 entities, points, components, len(term_pairs)
             )
@@ -412,7 +428,7 @@ class HessianBlocks:
     def _targets(
         self, pairs: BlockPairs
     ) -> Iterator[tuple[Array, tuple[IndexPair, ...], tuple[IndexPair, ...]]]:
-        """Iterate over the arrays of blocks, in the order of the values of `point_hessian`.
+        """Iterate over the arrays of blocks, in the order of the values of a Hessian's kernel.
 
         Yields
         ------
@@ -446,7 +462,10 @@ def _product(H: Array, products: Array) -> Array:
 def _positions(
     all_pairs: tuple[IndexPair, ...], term_pairs: tuple[IndexPair, ...]
 ) -> slice | list[int]:
-    """Return the indices of a term's pairs among all pairs, as a slice if they are contiguous."""
+    """Return the indices of a term's pairs among all pairs, as a slice if they are contiguous.
+
+    For example slice(1, 3) for the pairs (b, c) among (a, b, c), and [0, 2] for (a, c).
+    """
     positions = [all_pairs.index(pair) for pair in term_pairs]
     if positions and positions == list(range(positions[0], positions[-1] + 1)):
         return slice(positions[0], positions[-1] + 1)
@@ -468,8 +487,9 @@ def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
     nodes
         (cells, functions): local nodes of each cell.
     """
+    # the pairs a <= b of functions, in the order of K
     a, b = np.triu_indices(nodes.shape[1])
-    blocks = _full_blocks(K)
+    blocks = _full_blocks(K)  # (cells, pairs, 3, 3)
     # rows of a by columns of b; e counts cells, p pairs, c and d components
     products = np.einsum("epcd,epd->epc", blocks, x[nodes[:, b]])
     np.add.at(y, nodes[:, a], products)

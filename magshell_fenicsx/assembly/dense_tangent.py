@@ -138,7 +138,10 @@ class SinglePrecisionBlocks:
 
 
 class BlockProducts:
-    """Products of matrices of (3, 3) blocks with vectors, in C; the constructor is collective."""
+    """Products of matrices of (3, 3) blocks with vectors, in C; the constructor is collective.
+
+    The private fields `_lib` and `_ffi` are the compiled library and cffi's interface to it.
+    """
 
     def __init__(self, comm: MPI.Comm) -> None:
         source = Path(__file__).with_name("dense_tangent.c")
@@ -149,6 +152,7 @@ class BlockProducts:
 
         The C code for full rows takes v three times; the one for an upper triangle takes it once.
         """
+        # `pointer` gives C the address of an array; x is v in the form that the function takes
         pointer, lib = self._ffi.from_buffer, self._lib
         if isinstance(A, SinglePrecisionBlocks):
             starts, columns = A.starts, A.columns
@@ -220,6 +224,7 @@ class DenseRemainder:
 
     def times(self, v: Vector) -> Vector:
         """Return the product with a vector. Collective."""
+        # which of the own unknowns, and which of all, are clamped
         own_fixed, all_fixed = self.matrix.fixed
         all_entries = np.concatenate(self.matrix.comm.allgather(v))
         x = np.where(all_fixed, 0.0, all_entries)
@@ -235,6 +240,7 @@ class DenseRemainder:
         if not isinstance(other, DenseRemainder) or len(other.parts) != len(self.parts):
             return 0.0
         pairs = list(zip(self.parts, other.parts, strict=True))
+        # the ratio of each part to that of the other correction: all must be equal
         factors = {own_part.factor / other_part.factor for own_part, other_part in pairs}
         same_hessians = all(
             own_part.hessian is other_part.hessian for own_part, other_part in pairs
@@ -251,10 +257,13 @@ class DenseTangent:
 
     Clamped unknowns are treated as in `scatter.BlockMatrix`. The constructor is collective.
 
-    Private fields: `_owned` and `_ghosts` are numbers of local nodes, `_count` that of all nodes,
-    `_first` the global number of the first own node. `_dense` is what `_create_dense` returned.
-    `_blocks_of_terms` has for each term its latest Hessian, with its near blocks in double and
-    single precision. `_latest_common` has near blocks, and their entries in the latest pattern.
+    Private fields: `_owned` and `_ghosts` count own nodes and ghosts of this rank, `_count` all
+    nodes; `_first` is the global number of the first own node. `_ghost_numbers` are the global
+    numbers of the ghosts, `_ghost_owners` their ranks. `_products` multiplies blocks with vectors.
+    `_dense` has the entries in own columns, those in other columns, and the matrix of PETSc with
+    both. `_blocks_of_terms` has for each term its latest Hessian, with its near blocks in double
+    and single precision. `_latest_common` has near blocks, and their entries in the latest pattern.
+    `_shared_arrays` keeps the arrays of `_dense` alive.
 
     Parameters
     ----------
@@ -300,7 +309,8 @@ class DenseTangent:
         """
         n, first_column, column_count = 3 * self._owned, 3 * self._first, 3 * self._count
         kind = PETSc.IntType
-        # PETSc stores a matrix as two, each by starts of rows, columns and values
+        # PETSc stores a matrix as two, that of own columns and that of all others. Each has three
+        # arrays: starts of rows, columns and values
         inner, outer = np.zeros((n, n)), np.zeros((n, column_count - n))
         inner_columns = np.arange(n, dtype=kind)
         arrays = [(_row_starts(n, n), np.tile(inner_columns, n), inner.reshape(-1))]
@@ -339,9 +349,9 @@ class DenseTangent:
         -------
         K with the correction D; its lagged part is the whole tangent of the terms.
         """
-        # all entries of the terms, then without the ones that K takes
         starts, columns, values = K.getValuesCSR()
         scaled = [self.scaled_hessian(factor, term, inexact=inexact) for factor, term in terms]
+        # of each term K takes the entries in its pattern; the remainder leaves them out
         remainders = list[ScaledHessian]()
         for part in scaled:
             common = self._common_entries(starts, columns, part)
@@ -362,6 +372,8 @@ class DenseTangent:
         ----------
         starts, columns
             The pattern in compressed sparse rows, of own unknowns.
+        part
+            The Hessian of the term; its factor is not used.
         """
         # the latest ones serve for the same blocks and the same pattern, which contact changes
         if self._latest_common is not None:
@@ -381,11 +393,12 @@ class DenseTangent:
         return common
 
     def sum(self, K: PETSc.Mat, parts: Sequence[ScaledHessian]) -> PETSc.Mat:
-        """Return a sparse matrix plus scaled Hessians, with all entries. Collective.
+        """Return a sparse matrix K plus scaled Hessians (`parts`), with all entries. Collective.
 
         The next call overwrites the result.
         """
         n, first_column, (own_fixed, all_fixed) = 3 * self._owned, 3 * self._first, self.fixed
+        # arrays of the entries in own and in other columns, and the matrix of PETSc with both
         self._dense = inner, outer, matrix = self._dense or self._create_dense()
         # On one rank the rows are the matrix's own memory.
         rows = inner if self.comm.size == 1 else np.empty((n, 3 * self._count))
@@ -417,6 +430,7 @@ class DenseTangent:
             Whether it may be the Hessian of an earlier state.
         """
         hessian = term.hessian(inexact=inexact)
+        # (Hessian, its near blocks in double and in single precision), for the same Hessian
         blocks = self._blocks_of_terms.get(term.name)
         if blocks is None or blocks[0] is not hessian:
             near_blocks = self._sum_blocks(hessian.near_blocks)
@@ -427,7 +441,10 @@ class DenseTangent:
         return ScaledHessian(factor, near_blocks, single, hessian)
 
     def rows(self, term: DenseTerm) -> Array:
-        """Return the rows (own unknowns, all) of a term's Hessian, with supports. Collective."""
+        """Return the rows (own unknowns, all) of a term's Hessian, without constraints. Collective.
+
+        Rows and columns of clamped unknowns are not made zero.
+        """
         return self._all_rows(self.scaled_hessian(1.0, term))
 
     def product(self, parts: Sequence[ScaledHessian], x: Array, *, single: bool = False) -> Array:
@@ -435,6 +452,8 @@ class DenseTangent:
 
         Parameters
         ----------
+        parts
+            The scaled Hessians.
         x
             (3 all nodes,): the vector, the same on every rank.
         single
@@ -447,6 +466,7 @@ class DenseTangent:
         """
         product = np.zeros(3 * self._owned)
         for part in parts:
+            # this rank's part at local nodes, then the stored blocks at own nodes
             far = part.hessian.times_far(x[:, None]).reshape(-1, 3)
             near = self._products.times(part.single_blocks if single else part.near_blocks, x)
             product += part.factor * (near + self._sum_rows(far).ravel())
@@ -455,7 +475,7 @@ class DenseTangent:
         return product
 
     def times(self, terms: Sequence[tuple[float, DenseTerm]], v: Array) -> Array:
-        """Return the tangents of terms times a vector, both with ghosts. Collective.
+        """Return the tangents of terms times a vector v, both with ghosts. Collective.
 
         Ghosts are zero in the product.
 
@@ -473,7 +493,8 @@ class DenseTangent:
     def _all_rows(self, part: ScaledHessian) -> Array:
         """Return all entries of own rows of a Hessian, without its factor. Collective.
 
-        Products with unit vectors give the entries that are not stored.
+        Products with unit vectors give the entries that are not stored. Entries that the Hessian
+        `part` leaves out are zero.
         """
         left_out = 0.0 if part.left_out is None else part.left_out.toarray()
         rows = part.near_blocks.toarray() - left_out
@@ -497,7 +518,7 @@ class DenseTangent:
         if self.comm.size == 1:
             return rows
         own_rows, ghost_rows = rows[: self._owned].copy(), rows[self._owned :]
-        # to each rank the global numbers and the rows of the ghosts that it owns
+        # each rank gets the global numbers and the rows of those ghosts that it owns
         sent = [(self._ghost_numbers[i], ghost_rows[i]) for i in self._ghosts_of_ranks]
         for numbers, received_rows in self.comm.alltoall(sent):
             np.add.at(own_rows, numbers - self._first, received_rows)
@@ -515,8 +536,9 @@ class DenseTangent:
             return rows
         n = 3 * self._owned
         own_rows, ghost_entries = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
-        # rows are counted from the first ghost: three of each node
+        # the ghost, counted from the first one, and the component of each entry's row
         nodes, components = ghost_entries.row // 3, ghost_entries.row % 3
+        # each rank gets the entries (global row, column, value) in rows of its own nodes
         sent = list[tuple[NDArray[np.generic], ...]]()
         for ghosts_of_rank in self._ghosts_of_ranks:
             mask = np.isin(nodes, ghosts_of_rank)
@@ -552,13 +574,14 @@ def _entries(blocks: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp
     rows, columns
         (n,) places of the entries.
     """
+    # a block has the key row * width + column, by blocks; the keys ascend
     width, count = blocks.shape[1] // 3, len(blocks.indptr) - 1
     block_rows = np.repeat(np.arange(count, dtype=np.int64), np.diff(blocks.indptr))
     block_keys = block_rows * width + blocks.indices
     entry_keys = rows.astype(np.int64) // 3 * width + columns // 3
     if not len(block_keys):
         return np.zeros(len(entry_keys))
-    # keys row * width + column ascend, so that a search finds each block
+    # the block of each entry by a search for its key; another key is found if there is no block
     positions = np.minimum(np.searchsorted(block_keys, entry_keys), len(block_keys) - 1)
     values = blocks.data[positions, rows % 3, columns % 3]
     return np.where(block_keys[positions] == entry_keys, values, 0.0)

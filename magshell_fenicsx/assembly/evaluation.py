@@ -53,6 +53,11 @@ class Evaluation:
     changes nothing that another one sees. Results that terms compute from displacement and
     amplitudes are shared by all evaluations of a state; see `memo.Memo`.
 
+    The system's private methods do the work on its local vectors, which have ghosts: `_put` writes
+    a state into the forms, `_factors` gives each term's factor at some amplitudes, `_gradient` this
+    rank's part of a weighted sum of dPi_i/du, and `_column` that of d2Pi/du dmu. `_summed` sums
+    such parts over the ranks, and makes the result zero at supports unless told otherwise.
+
     Parameters
     ----------
     u, mu
@@ -87,7 +92,7 @@ class Evaluation:
         """
         system, mu = self._system_at_state, self._mu
         potentials = {t.name: float(system.comm.allreduce(t.energy())) for t in system.terms}
-        # without amplitudes supports do not move
+        # with amplitudes supports move, and lids sweep a volume
         pressure = system.edge_pressure
         if mu and pressure and pressure.load in potentials:
             potentials[pressure.load] += system.lid_potential(mu, pressure.load)
@@ -116,6 +121,7 @@ class Evaluation:
         local: NDArray[np.float64] = np.zeros_like(self._system.u.x.array)
 
         def add() -> None:
+            """Add this rank's part of each form."""
             for form in forms:
                 fem.assemble_vector(local, form)
 
@@ -132,8 +138,9 @@ class Evaluation:
     def residual(self, *, inexact: bool = False) -> Vector:
         """Return dPi/du at own unknowns, zero at supports. Collective.
 
-        Along directions in which oblique supports hold nodes it is u itself. The names of terms
-        that are not numbers are put into the system's `nan_terms`.
+        Along directions in which oblique supports hold nodes it is u itself, so that u is zero
+        there in equilibrium. If the residual is not finite, the names of the terms to blame are put
+        into the system's `nan_terms`.
 
         Parameters
         ----------
@@ -183,7 +190,7 @@ class Evaluation:
         """
         system = self._system
         used = [t for t in system.terms if factors[t.name]]
-        # not a number if the energy or an entry of the gradient is none
+        # this sum is not a number if the energy or an entry of the gradient is none
         sums = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
         reasons = {t.name: getattr(t, "no_number", "") for t in used}
         names = [name + reasons[name] for name, total in sums.items() if not system._finite(total)]
@@ -192,7 +199,7 @@ class Evaluation:
     def forces(self, name: str = "") -> Vector:
         """Return dPi/du at all own nodes, supports too. Collective.
 
-        Of all terms it is at supports the force of the supports on the shell.
+        With all terms, its values at supports are the forces of the supports on the shell.
 
         Parameters
         ----------
@@ -247,39 +254,43 @@ class Evaluation:
         moving = system.moving
         if moving and name in moving.names:
             local = float(system._gradient(system._factors(mu)) @ moving.rate(mu, name))
-            # the normal of a clamped edge turns too: the work of its forces along the spin A r;
-            # `edge` is the name of the edge's term
+            # the normal of a clamped edge turns too, which acts like the displacement A r: the
+            # forces of the edge's term, named `edge`, do work along it
             for edge, A in moving.turning(mu, name):
                 spin = moving.spin_displacement(A, system.u.x.array)
                 local += float(system._gradient({edge: 1.0}) @ spin)
         else:
+            # the derivatives dPi_i/dp by a free parameter, then the terms that mu multiplies
             slopes = system.parameters[name].slopes if name in system.parameters else ()
             local = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
             local += sum(t.energy() for t in system.terms if t.amplitude == name)
         return float(system.comm.allreduce(local)) + system.lid_potential(mu, name)
 
     def curvature(self, name: str, other: str) -> float:
-        """Return d2Pi/dmu_i dmu_j of two amplitudes, on every rank. Collective.
+        """Return d2Pi/dmu_i dmu_j of the amplitudes `name` and `other`, on every rank. Collective.
 
         One of the two is a coordinate of the system: it moves supports or is a free parameter.
         """
         system, mu = self._system_at_state, self._mu
         moving = system.moving
         if moving and {name, other} & moving.names:
-            # False sorts first: the last one of the pair moves supports
-            pair = sorted((name, other), key=moving.names.__contains__)
-            local = system._motion_curvature(moving, mu, *pair)
+            # an amplitude that moves supports comes last: False sorts first
+            any_amplitude, motion = sorted((name, other), key=moving.names.__contains__)
+            local = system._motion_curvature(moving, mu, any_amplitude, motion)
             return float(system.comm.allreduce(local)) + system.lid_potential(mu, name, other)
-        # from here on `name` is a free parameter
+        # no amplitude moves supports. The two are exchanged if need be, so that `name` is a free
+        # parameter; `other` is one too, or it multiplies terms
         if name not in system.parameters:
             name, other = other, name
         parameter, local = system.parameters[name], 0.0
+        # terms whose amplitude is the other one
         local += sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         if other in system.parameters:
+            # second derivatives d2Pi_i/dp dq by both parameters
             second = system.parameters[other]
             derivatives = parameter.second_derivatives(second.constant)
             local += sum(factor_of(d.amplitude, mu) * d.energy() for d in derivatives)
-            # a term whose amplitude is the first parameter
+            # terms whose amplitude is the first parameter
             local += sum(slope.energy() for slope in second.slopes if slope.amplitude == name)
         return float(system.comm.allreduce(local))
 
@@ -303,6 +314,7 @@ class Evaluation:
         """
         system = self._system
         with system.assembly:
+            # with ghosts, and with the displacement E(mu) of nodes that move
             local_stress = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
             system._put(self._u, self._mu)
             factors = system._factors(self._mu)
@@ -338,7 +350,7 @@ class Noise:
     @classmethod
     def from_environment(cls) -> "Noise | None":
         """Return the noise that the environment variable sets; None if it is not set."""
-        words = os.environ.get(NOISE_VARIABLE, "").split()
+        words = os.environ.get(NOISE_VARIABLE, "").split()  # the level and the seed
         if not words:
             return None
         return cls(float(words[0]), int(words[1]) if len(words) > 1 else 0)
@@ -351,7 +363,7 @@ class Noise:
         first
             Global number of this rank's first entry.
         """
-        # global numbers, so that the noise does not depend on the distribution; the column is 0
+        # factors follow from global numbers of rows, whatever the distribution; the column is 0
         rows = first + np.arange(len(b), dtype=np.uint64)
         return b * self._factors(rows, np.zeros(1, dtype=np.uint64))
 
@@ -381,4 +393,5 @@ class Noise:
         for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # splitmix64
             x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
         x ^= x >> np.uint64(31)
+        # the 64 bits as a number from -1 to 1
         return 1 + self.level * (x.astype(float) / 2**63 - 1)

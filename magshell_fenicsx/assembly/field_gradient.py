@@ -125,6 +125,7 @@ def derivatives_by_field(
         (cells, nodes, components) in this rank's own cells.
     """
     domain = f.function_space.mesh
+    # the space of f without continuity: each cell has values of its own
     Q = broken_space(f.function_space)
     v, derivatives = ufl.TestFunction(Q), fem.Function(Q)
     for weighted in weighted_terms:

@@ -115,10 +115,20 @@ class FiniteElementSystem:
         Names of the terms that were not numbers at the latest residual that was none.
     coordinates
         Names of the amplitudes that move supports or are free parameters.
+    clamped, projection
+        The supports: Dirichlet conditions, and the projection P of oblique supports, or None.
+    parameters, moving, edge_pressure
+        Free parameters by name, the motion E(mu), and the live pressure at edges that move.
+    added_tangents, dense_terms
+        The tangents of nonlocal terms, and the terms that couple all unknowns, or None.
+    assembly, noise
+        Stopwatch of the assembly, and artificial rounding errors for tests, or None.
 
     Private fields: `_fixed` are the own clamped unknowns, `_settings` the numbers in the forms with
-    their values in a state that has none. `_b` is a field for exchange between ranks. `_K` and
-    `_K_free` are the matrices of the forms with and without supports, `_N` that of the skew part.
+    their values in a state that has none. `_angle_terms` are the moments on edges, whose angle is a
+    history variable. `_terms_with_residual` are the terms whose own forms give the residual. `_b`
+    is a field for exchange between ranks. `_K` and `_K_free` are the matrices of the forms with and
+    without supports, `_N` that of the skew part.
     """
 
     def __init__(
@@ -151,6 +161,7 @@ class FiniteElementSystem:
         self.moving, self.edge_pressure = moving, moving.edge_pressure if moving else None
         self._angle_terms = [t for t in terms if isinstance(t, AngleTerm)]
         # the reference angle of each edge under a moment is a number of the state, zero at first
+        # (`turn` is its name in the state, the term itself is the number that can be set)
         reference_angles = {t.turn: (t, 0.0) for t in self._angle_terms}
         self.history: dict[str, Setting] = {**variables.history, **reference_angles}
         constants = {name: parameter.constant for name, parameter in self.parameters.items()}
@@ -204,7 +215,7 @@ class FiniteElementSystem:
         value
             Its value in all states without that name.
         """
-        # its matrix is its own: both systems may be in use at once
+        # a shallow copy with a matrix of its own: both systems may be in use at once
         system = copy(self)
         system._settings = {name: (number, value)} | self._settings
         if self._assembler is None:
@@ -213,7 +224,7 @@ class FiniteElementSystem:
 
     @property
     def has_dense_terms(self) -> bool:
-        """Whether terms couple all unknowns; see `continuation.system.InexactSystem`."""
+        """Whether terms couple all unknowns, whose forces and tangent may be extrapolated."""
         return self.dense_terms is not None
 
     def at_state(self, state: State) -> Evaluation:
@@ -232,6 +243,7 @@ class FiniteElementSystem:
         """
         if not self._angle_terms:
             return state
+        # the angles are measured near the earlier ones, so that whole turns are counted
         past = {t.turn: before.get(t.turn, 0.0) for t in self._angle_terms}
         angles = self.at_state(State(state.u, state.mu | past)).evaluate(
             lambda: {t.turn: t.angle() for t in self._angle_terms}
@@ -291,7 +303,7 @@ class FiniteElementSystem:
         return Evaluation(self, u, mu).potential(name)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        """Return d2Pi/dmu_i dmu_j of two amplitudes, on every rank. Collective.
+        """Return d2Pi/dmu_i dmu_j of the amplitudes `name` and `other`, on every rank. Collective.
 
         It is zero between amplitudes that multiply their terms.
         """
@@ -300,7 +312,7 @@ class FiniteElementSystem:
         return Evaluation(self, u, mu).curvature(name, other)
 
     def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
-        """Return the potential of each term by name, see `Evaluation.energies`. Collective.
+        """Return the potential Pi_i of each term by name, without its amplitude. Collective.
 
         Supports do not move if no amplitudes are given.
         """
@@ -346,7 +358,10 @@ class FiniteElementSystem:
             self.projection.project(u)
 
     def _put(self, u: Vector, mu: Amplitudes) -> None:
-        """Put a state into the forms: the displacement, the numbers and the nodes that move."""
+        """Put a state into the forms: the displacement, the numbers and the nodes that move.
+
+        Nodes move only if the state has the amplitudes of all motions.
+        """
         for name, (number, value) in self._settings.items():
             number.value = mu.get(name, value)
         self.u.x.array[: self.size] = u
@@ -384,10 +399,11 @@ class FiniteElementSystem:
         pressure = self.edge_pressure
         if pressure is None:
             return 0.0
-        # p V is linear in p: at most one of the amplitudes may be that of the pressure
+        # p V is linear in p: by two amplitudes of the pressure the derivative is zero
         motions = [name for name in names if name != pressure.load]
         if len(names) - len(motions) > 1:
             return 0.0
+        # the factor of V is the pressure, or its derivative by the amplitude
         by_pressure = len(motions) < len(names)
         factor = pressure.unit if by_pressure else pressure.unit * mu.get(pressure.load, 0.0)
         # V or its first or second derivative, by as many motions
@@ -404,23 +420,25 @@ class FiniteElementSystem:
         other, name
             The two amplitudes; `name` moves supports, `other` may do so.
         """
-        # `name` moves nodes with the rate dE/dmu; d2Pi/du dmu of `other` is the change of forces
+        # `name` moves nodes with the rate dE/dmu, along which `other` changes forces by d2Pi/du dmu
         curvature = moving.rate(mu, name) @ self._column(mu, other)
         if other not in moving.names:
             return float(curvature)
-        # both move supports: `other` moves nodes while `name` turns normals, and the curvature of E
+        # both move supports: the nodes that `other` moves do work with the forces that change as
+        # `name` turns normals, and the forces do work along the second derivative of E
         residual, u = self._gradient(self._factors(mu)), self.u.x.array
         curvature += (
             moving.rate(mu, other) @ self._turning_column(mu, name)
             + moving.bend(mu, name, other) @ residual
         )
-        # both turn the normal of an edge: the change of its forces by one spin, times the other
+        # both turn the normal of an edge, which acts like two displacements A r: the forces change
+        # along one of them, and do work along the other
         spins_by_other = dict(moving.turning(mu, other))
         for edge, A in moving.turning(mu, name):
             if edge in spins_by_other:
                 spin = moving.spin_displacement(A, u)
                 curvature += spin @ self._turned_column(edge, spins_by_other[edge])
-        # and the derivative of one spin by the other amplitude, times the forces
+        # the forces also do work along the derivative of one displacement by the other amplitude
         for edge, A_slope in moving.turning_twice(mu, (name, other)):
             curvature += moving.spin_displacement(A_slope, u) @ self._gradient({edge: 1.0})
         return float(curvature)
@@ -431,11 +449,13 @@ class FiniteElementSystem:
         The amplitude `name` moves supports, is a free parameter, or multiplies terms.
         """
         if self.moving and name in self.moving.names:
-            # by the moving nodes, K dE/dmu, and by the normals that turn
+            # the forces change by K dE/dmu as nodes move, and as the normals of edges turn
             rate = self.moving.rate(mu, name)
             product = self._tangent_product(rate, self._factors(mu))
             return product + self._turning_column(mu, name)
         if name in self.parameters:
+            # the derivatives of terms by the parameter, each with the factor of its term; the
+            # parameter may multiply other terms as well
             slopes = [
                 (factor_of(slope.amplitude, mu), slope) for slope in self.parameters[name].slopes
             ]
@@ -463,8 +483,8 @@ class FiniteElementSystem:
     def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the change of a clamped edge's forces as its normal turns, this rank's part.
 
-        The energy depends on the normal through Q^T r alone, r the place: a turn acts like the
-        displacement A r, and turns the forces.
+        The energy depends on the normal through Q^T r alone, r the place. So a turn acts like the
+        displacement A r, and turns the forces in addition.
 
         Parameters
         ----------
@@ -493,7 +513,7 @@ class FiniteElementSystem:
         if self._assembler:
             product = self._assembler.times(v, factors)
         else:
-            K = self._assemble_forms(self._K_free, factors, [])  # without supports
+            K = self._assemble_forms(self._K_free, factors, clamped=[])  # without supports
             x, product = K.createVecRight(), np.zeros_like(v)
             x.array[:] = v[: self.size]
             product[: self.size] = (K * x).array
@@ -527,7 +547,7 @@ class FiniteElementSystem:
             K = self._assemble_forms(self._K, factors, self.clamped)
         for nonlocal_tangent in self.added_tangents:
             K = nonlocal_tangent.sum(K, factors)
-        N = self._skew(factors)
+        N = self._skew(factors)  # None if all loads have a potential
         if self.dense_terms:
             K = self._corrected(K, self.dense_terms, factors, inexact=inexact)
             if N or self.projection or self.noise:  # these need all entries of K + D
@@ -561,6 +581,7 @@ class FiniteElementSystem:
         corrected = dense_terms.corrected(K, factors, inexact=inexact)
         if not (isinstance(corrected, CorrectedTangent) and inexact):
             return corrected
+        # products with the tangent at the present state, from computed and from extrapolated forces
         dense_factors = {t.name: factors[t.name] for t in dense_terms.terms}
         return replace(
             corrected,
@@ -592,23 +613,26 @@ class FiniteElementSystem:
             u_at_call, product = np.array(self.u.x.array), np.zeros(self.size)
             for sign in (1.0, -1.0):
                 self.u.x.array[:] = u_of_tangent + sign * step * direction
-                gradient = self._gradient(factors, inexact=inexact)
-                product += sign / (2 * step) * self._summed(gradient)
+                gradient = self._gradient(factors, inexact=inexact)  # this rank's part
+                product += sign / (2 * step) * self._summed(gradient)  # the sum of all ranks
             self.u.x.array[:] = u_at_call
             return product
 
         return times
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
-        """Return the skew part of the tangent, of loads without potential; None without such."""
-        forms = [t for t in self.terms if isinstance(t, FormTerm)]
-        loads = [t for t in forms if not t.has_potential and factors[t.name]]
-        if not loads:
+        """Return the skew part of the tangent, of loads without potential; None without such.
+
+        `factors` maps the name of a term to the factor of its tangent. Collective.
+        """
+        form_terms = [t for t in self.terms if isinstance(t, FormTerm)]
+        loads_without_potential = [t for t in form_terms if not t.has_potential and factors[t.name]]
+        if not loads_without_potential:
             return None
         if self._N is None:
-            self._N = fem_petsc.create_matrix(loads[0].skew_form)
+            self._N = fem_petsc.create_matrix(loads_without_potential[0].skew_form)
         self._N.zeroEntries()
-        for t in loads:
+        for t in loads_without_potential:
             t.add_skew(self._N, factors[t.name], self.clamped)
         self._N.assemble()
         return self.projection.project_both_sides(self._N) if self.projection else self._N

@@ -92,6 +92,7 @@ class FreeParameter:
             Another parameter as it stands in the terms, or p itself.
         """
         if q not in self._second_derivatives:
+            # an amplitude of the placement differentiates by differences, a constant by forms
             if hasattr(q, "second_derivatives"):
                 self._second_derivatives[q] = q.second_derivatives(self.constant)
             else:
@@ -130,7 +131,9 @@ def make_parameters(
         for slope in slopes:
             slope.compile_residual()
         differentiate_slopes = partial(derivatives, terms=slopes, suffix="twice")
-        parameters[name] = FreeParameter(p, slopes, differentiate_slopes)
+        parameters[name] = FreeParameter(
+            constant=p, slopes=slopes, differentiate_slopes=differentiate_slopes
+        )
     return parameters
 
 
@@ -158,6 +161,9 @@ class PlacementAmplitudes:
         A copy of the placement with zero amplitudes.
     steps
         Amplitude -> step of its differences.
+
+    Private fields: `_r0` is the placement, `_values` has the present value of each amplitude,
+    `_shapes` the nodal values of each shape.
     """
 
     def __init__(self, r0: fem.Function, shapes: Mapping[str, fem.Function], length: float) -> None:
@@ -224,7 +230,9 @@ class PlacementAmplitudes:
         amplitudes = {name: PlacementAmplitude(self, name, terms, others) for name in self._values}
         return {
             name: FreeParameter(
-                amplitude, amplitude.slopes(gradients), amplitude.second_derivatives
+                constant=amplitude,
+                slopes=amplitude.slopes(gradients),
+                differentiate_slopes=amplitude.second_derivatives,
             )
             for name, amplitude in amplitudes.items()
         }
@@ -324,15 +332,16 @@ class _PlacementDerivative:
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times the gradient of the derivative to the local vector b."""
-        # names of the terms whose residual `gradients` computes; a derivative has no name
+        # names: the terms whose residual `gradients` computes; others: those with forms of their
+        # own, and derivatives, which have no name
         assembled = self.gradients.names if self.gradients else frozenset[str]()
         names = [name for term in self.terms if (name := getattr(term, "name", "")) in assembled]
         others = [term for term in self.terms if getattr(term, "name", "") not in assembled]
 
         def add(weight: float) -> float:
-            """Add the weighted gradients at the present placement to b.
+            """Add the gradients at the present placement, times a weight, to b.
 
-            The sum in b is the result; the value 0 only serves `differentiate`.
+            The sum in b is the result. The value 0 is returned because `differentiate` sums values.
             """
             if self.gradients:
                 self.gradients.add(b, dict.fromkeys(names, weight * factor))

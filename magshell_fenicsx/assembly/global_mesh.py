@@ -101,22 +101,23 @@ def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
         (local nodes, ghosts included): numbers of components, the same on all ranks.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, V.dofmap.list
-    # edges from the first node of each cell to all of its nodes
+    # the components on this rank: edges go from the first node of each cell to all of its nodes
     count, local_labels = _graph_components(
         np.repeat(cells[:, 0], cells.shape[1]),
         cells.ravel(),
         index_map.size_local + index_map.num_ghosts,
     )
     counts = comm.allgather(count)
-    # labels of different ranks differ
+    # labels of different ranks are made different
     labels = local_labels + sum(counts[: comm.rank])
-    # where two ranks share a node, their components are one: the owner's label tells which
+    # where two ranks share a node, their components are one. A field over the nodes, whose values
+    # ghosts get from the owners, gives each local node the label on the owning rank
     owner_field = fem.Function(V)
     nodal = owner_field.x.array.reshape(-1, V.dofmap.bs)
     nodal[:] = labels[:, None]
     owner_field.x.scatter_forward()
     owner_labels = nodal[:, 0].astype(np.int64)
-    # edges of a graph whose nodes are the labels of all ranks
+    # a graph whose nodes are the labels of all ranks: an edge links two labels of one node
     links = np.unique(np.column_stack([labels, owner_labels]), axis=0)
     all_links = np.concatenate(comm.allgather(links))
     link_starts, link_ends = all_links.T

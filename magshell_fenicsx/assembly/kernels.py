@@ -70,7 +70,7 @@ class _MeshlessForm:
     rank: int
 
 
-_compiled_forms: dict[FormKey, _MeshlessForm] = {}
+_compiled_forms: dict[FormKey, _MeshlessForm] = {}  # of this process
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class DerivedForm:
             A compiled form with the same key.
         """
         fields, constants = self.origin.coefficients(), self.constants
-        # the origin has its own arguments; a derivative's are in the space of `u`
+        # spaces of the arguments: the origin's own, or for a derivative that of `u`
         if self.u is None:
             spaces = [argument.ufl_function_space() for argument in self.origin.arguments()]
         else:
@@ -155,6 +155,7 @@ class DerivedForm:
         """
         if has_type(self.origin, Label):
             return None
+        # positions of the kernels' data among those of the origin
         origin_fields, origin_constants = self.origin.coefficients(), self.constants
         ordered_fields = kernels.order_fields(form.coefficients())
         fields = [_position(f, origin_fields) for f in ordered_fields]
@@ -341,6 +342,7 @@ class KernelLog:
             Mappings from the name of each form to the form.
         """
         forms = {name: form for group in groups for name, form in group.items()}
+        # each form is its own origin
         compiled = self._compile_together({name: underived(form) for name, form in forms.items()})
         return dict(zip(forms, compiled, strict=True))
 
@@ -351,7 +353,7 @@ class KernelLog:
         """
         requests = [self.request_form(name, form) for name, form in forms.items()]
         origins = [form.origin for form in forms.values()]
-        # an empty form has no mesh, and so no communicator
+        # forms that are not empty: an empty form has no mesh, and so no communicator
         integrals = [form for form in origins if isinstance(form, ufl.Form) and not form.empty()]
         if integrals:
             self.compile_requested(_domain_of(integrals[0]).ufl_cargo().comm)
@@ -372,15 +374,15 @@ class KernelLog:
                 compiled = form.bind(_compiled_forms[key])
                 return lambda: compiled
             ufl_form = form.make()
-            if not isinstance(ufl_form, ufl.Form):
+            if not isinstance(ufl_form, ufl.Form):  # UFL has simplified it to a number
                 return lambda: ufl_form
             if ufl_form.empty():
                 return lambda: None
             library = self._request_library(
-                compat.form_signature(ufl_form),
-                partial(compat.form_code, ufl_form),
-                FORM_OPTIONS,
-                _tensor_size(ufl_form),
+                key=compat.form_signature(ufl_form),
+                source=partial(compat.form_code, ufl_form),
+                options=FORM_OPTIONS,
+                size=_tensor_size(ufl_form),
             )
             # loaded at the first call, when all requests are compiled together
             return cache(lambda: self._load_form(form, ufl_form, library()))
@@ -388,7 +390,10 @@ class KernelLog:
             self._note(name, start)
 
     def _load_form(self, form: DerivedForm, ufl_form: ufl.Form, library: ctypes.CDLL) -> fem.Form:
-        """Return a compiled form from its library; keep it for other forms with the same key."""
+        """Return a compiled form from its library; keep it for other forms with the same key.
+
+        `form` says how it is derived, `ufl_form` is the derived form.
+        """
         kernels, key = compat.FormKernels.from_library(ufl_form, library), form.key
         if key and (meshless := form.without_mesh(ufl_form, kernels)):
             _compiled_forms[key] = meshless
@@ -427,9 +432,22 @@ class KernelLog:
     def _request_library(
         self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """Request a library without a note in the log.
+        """Request a library with a C function, without a note in the log.
 
-        Parameters as in `request_library`. Two requests with one key share the library.
+        Two requests with one key share the library.
+
+        Parameters
+        ----------
+        key
+            Determines the source and the options.
+        source, options
+            Returns the C source; options of the compiler.
+        size
+            How many numbers the function returns.
+
+        Returns
+        -------
+        A function that returns the library. Its first call compiles all requested kernels.
         """
         library = Library(key, source, options)
         request = self._requested.setdefault(library.file, _RequestedLibrary(library, size))

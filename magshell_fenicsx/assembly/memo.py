@@ -82,8 +82,8 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
     values
         (local cells, q, size), as they were last renewed.
 
-    The private field `_dofs` (local cells, q) numbers the points of each cell, `_memo` computes the
-    values.
+    The private field `_dofs` (local cells, q) has the numbers of each cell's points in the field's
+    array; `_memo` computes the values.
     """
 
     def __init__(self, domain: mesh.Mesh, degree: int, size: int) -> None:
@@ -150,6 +150,7 @@ def at_quadrature(field: fem.Function, points: Array) -> Array:
         second component is zero.
     """
     components, V = field.function_space.dofmap.bs, field.function_space
+    # the shape functions (points, functions), times the nodal values of each cell
     shape = V.element.basix_element.tabulate(0, points)[0, :, :, 0]
     values = np.asarray(shape @ field.x.array.reshape(-1, components)[V.dofmap.list])
     if components != 2:

@@ -121,7 +121,15 @@ def dense_terms(
 
 @dataclass(frozen=True)
 class DenseTerms:
-    """Terms that couple all unknowns: their tangent is a dense correction of the sparse one."""
+    """Terms that couple all unknowns: their tangent is a dense correction of the sparse one.
+
+    Attributes
+    ----------
+    matrix
+        The object that computes the correction and its products.
+    terms
+        The terms.
+    """
 
     matrix: DenseTangent
     terms: Sequence[DenseTerm]
@@ -146,7 +154,10 @@ class DenseTerms:
         return self.matrix.corrected(K, terms, inexact=inexact) if terms else K
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """Return the terms' product with v, see `AddedTangent`. Collective."""
+        """Return this rank's part of the tangents' product with v, both with ghosts. Collective.
+
+        `factors` maps the name of a term to the factor of its tangent.
+        """
         return self.matrix.times(self._weighted(factors), v)
 
     def _weighted(self, factors: Factors) -> list[tuple[float, DenseTerm]]:
@@ -184,8 +195,9 @@ class NonlocalEntries:
     It is an `AddedTangent`. The constructor is collective.
 
     Private fields: `_ranges` has the first unknown of each rank and the number of all, `_own` is
-    the slice of own unknowns, `_fixed` tells of all unknowns whether they are clamped. `_sum` is
-    the latest matrix with room for expected entries, which belong to `_pattern_keys`.
+    the slice of own unknowns, `_fixed` tells of all unknowns whether they are clamped.
+    `_block_size` is the number of unknowns of a node. `_sum` is the latest sum with room for
+    expected entries; these were expected at the pattern keys `_pattern_keys` of the terms.
 
     Parameters
     ----------
@@ -230,6 +242,7 @@ class NonlocalEntries:
         if not weighted_entries:
             return K
         all_entries = _weighted_sum(weighted_entries)
+        # the entries in own rows, (own unknowns, all), without those of clamped unknowns
         added = _owned_rows(self._comm, self._ranges, self._fixed, all_entries)
         if not self._comm.allreduce(added.nnz):
             return K
@@ -242,7 +255,8 @@ class NonlocalEntries:
     def _sum_with_room(self, K: PETSc.Mat, factors: Factors) -> "_MatrixSum":
         """Return the sum of K with room for all expected entries. Collective.
 
-        It is made anew where the terms expect other entries, or K is another object.
+        It is made anew where the terms expect other entries, or K is another object. Terms whose
+        factor in `factors` is zero do not count.
         """
         keys = tuple((t.name, t.pattern_key) for t in self._terms if factors.get(t.name, 0.0))
         if self._sum is None or self._pattern_keys != keys or self._sum.sparse.handle != K.handle:
@@ -251,9 +265,14 @@ class NonlocalEntries:
         return self._sum
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """Return the terms' product with v, see `AddedTangent`. Collective."""
+        """Return this rank's part of the tangents' product with v, both with ghosts. Collective.
+
+        `factors` maps the name of a term to the factor of its tangent. Ghosts are zero in the
+        product.
+        """
         product, size = np.zeros_like(v), self._own.stop - self._own.start
         if entries := self._entries(factors):
+            # the product of this rank's entries, with rows of all unknowns
             local = times(entries, np.concatenate(self._comm.allgather(v[:size])))
             product[:size] = self._comm.allreduce(local)[self._own]
         return product
@@ -263,14 +282,17 @@ class NonlocalEntries:
         return [(factor, t.entries()) for t in self._terms if (factor := factors.get(t.name, 0.0))]
 
     def _expected_pattern(self, factors: Factors) -> csr_array:
-        """Return the pattern (own unknowns, all) of expected entries of the terms. Collective."""
+        """Return the pattern (own unknowns, all) of expected entries of the terms. Collective.
+
+        Terms whose factor in `factors` is zero do not count.
+        """
         pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
         row_nodes, column_nodes = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
         node_count = len(self._fixed) // self._block_size
         # each pair of nodes once, as the number row * node_count + column
         pair_numbers = np.unique(row_nodes * node_count + column_nodes)
         row_nodes, column_nodes = np.divmod(pair_numbers, node_count)
-        # the unknowns of these nodes, (pairs, 1, 3)
+        # the unknowns of the row node (i) and of the column node (j) of each pair, (pairs, 1, 3)
         i, j = (
             self._block_size * nodes[:, None, None] + np.arange(self._block_size)
             for nodes in (row_nodes, column_nodes)
@@ -286,7 +308,9 @@ class _MatrixSum:
 
     The fixed pattern is the union of the sparse matrix's pattern and of the room; `_values` are its
     values, row by row. `_at_sparse` and `_at_room` are the places of both patterns' entries in
-    them. `_room_keys` are the keys of the room's entries, see `_entry_keys`.
+    them. `_room_keys` has the number row * width + column for each entry of the room, ascending.
+    `_is_own` tells which values are in columns of own unknowns. `_matrix` is the matrix of PETSc,
+    which shares the memory of `_arrays`: starts, columns and values of its one or two parts.
 
     Parameters
     ----------
@@ -344,13 +368,16 @@ class _MatrixSum:
     def update(self, added: csr_array) -> PETSc.Mat:
         """Return the sum of the present sparse matrix and of entries within the room.
 
-        It is always the same object.
+        `added` (own unknowns, all) has the entries. The result is always the same object.
         """
         # into the union of both patterns; PETSc sees the same memory on one rank
         self._values[:] = 0.0
-        self._values[self._at_sparse] = self.sparse.getValuesCSR()[2]
+        _, _, sparse_values = self.sparse.getValuesCSR()
+        self._values[self._at_sparse] = sparse_values
+        # the place of each entry in the room, then in the union
         positions = np.searchsorted(self._room_keys, _entry_keys(added))
         self._values[self._at_room[positions]] += added.data
+        # on several ranks the values are copied into the two parts of PETSc
         if self.sparse.comm.size > 1:
             masks = self._is_own, ~self._is_own
             for (_, _, values), mask in zip(self._arrays, masks, strict=True):
@@ -483,7 +510,7 @@ def _selected_columns(
     -------
     Starts of the rows, columns, and zeros as values.
     """
-    # the number of selected entries before each entry, and so before the first one of each row
+    # the number of selected entries before each entry: at the start of a row it is the new start
     selected_before = np.concatenate([[0], np.cumsum(mask)])
     starts = selected_before[matrix.indptr]
     columns = matrix.indices[mask] - first

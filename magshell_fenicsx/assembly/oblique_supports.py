@@ -78,7 +78,8 @@ class Projection:
 
     Private fields: `_nodes` are the supported local nodes, ascending, and `_P` (nodes, 3, 3) their
     projectors. `_P_matrix` and `_complement` are P and I - P as matrices, made at first use.
-    `_unprojected` is the latest K, and `_projected` its product.
+    `_unprojected` is the latest K, and `_projected` its product. `_owned` is the number of own
+    nodes, `_first` the global number of the first one.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class Projection:
         if self._P_matrix is None:
             self._P_matrix = self._block_diagonal(self._P, 1.0)
             self._complement = self._block_diagonal(np.eye(3) - self._P, 0.0)
-        # PETSc reuses the last product for the same pattern
+        # P K P; for the same K PETSc writes into the last product
         is_same = self._unprojected is not None and self._unprojected.handle == K.handle
         self._projected = K.ptap(self._P_matrix, self._projected if is_same else None)
         self._unprojected = K
@@ -148,7 +149,7 @@ class Projection:
 
         Directions of supports then have no finite eigenvalue.
         """
-        product = self.project_both_sides(M)
+        product = self.project_both_sides(M)  # P M P
         product.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return product
 
@@ -181,6 +182,7 @@ def _complement(directions: Array) -> Array:
 
     Nearly equal directions count as one.
     """
-    _, sizes, axes = np.linalg.svd(directions)
-    spanned = axes[: len(sizes)][sizes > DIRECTION_TOLERANCE]
+    # orthonormal axes; those with a singular value above the tolerance span the directions
+    _, singular_values, axes = np.linalg.svd(directions)
+    spanned = axes[: len(singular_values)][singular_values > DIRECTION_TOLERANCE]
     return np.asarray(np.eye(3) - spanned.T @ spanned)

@@ -97,13 +97,14 @@ class EdgeCurve:
         tables = {
             number: _tabulate_side(element, side, points, weights) for number, side in sides.items()
         }
-        # the cell of each facet, the facet's number in the cell, and the corners at its ends
+        # the cell of each facet, then the facet's number in the cell
         cells = [int(topology.connectivity(dim - 1, dim).links(facet)[0]) for facet in facets]
         facets_of_cells = topology.connectivity(dim, dim - 1)
         numbers = [
             int(np.flatnonzero(facets_of_cells.links(cell) == facet)[0])
             for cell, facet in zip(cells, facets, strict=True)
         ]
+        # the vertices at both ends of each side
         vertices_of_cells = topology.connectivity(dim, 0)
         corners_of_sides = {number: list(corners) for number, (_, _, corners) in sides.items()}
         corners = [
@@ -111,7 +112,8 @@ class EdgeCurve:
             for cell, number in zip(cells, numbers, strict=True)
         ]
         flat_corners = np.array(corners, dtype=np.int32).ravel()
-        # the tables of each facet; the sign turns curves whose surface is on the right
+        # the shape functions and weighted slopes of each facet; the sign turns curves whose surface
+        # is on the right
         shape = len(cells), len(weights), element.dim
         values = np.reshape([tables[number][0] for number in numbers], shape)
         slopes = np.reshape([tables[number][1] for number in numbers], shape)
@@ -237,7 +239,7 @@ class Lid:
             y_cross_slope = np.cross(y, curve.derivative(x))
             area -= y_cross_slope.sum(axis=(0, 1)) / 2
             moment -= np.einsum("sqi,sqj->ij", y, y_cross_slope) / 3
-        return cls(motions, origin, comm.allreduce(area), comm.allreduce(moment))
+        return cls(motions, origin, area=comm.allreduce(area), moment=comm.allreduce(moment))
 
     @classmethod
     def disc(cls, rho: float, motions: Sequence[RigidMotion], *, last: bool) -> "Lid":
@@ -251,7 +253,12 @@ class Lid:
             Whether it is at the last end; its normal then points the other way.
         """
         area = np.array([0.0, 0.0, np.pi * rho**2])
-        return cls(motions, np.zeros(3), -area if last else area, np.zeros((3, 3)))
+        return cls(
+            motions,
+            origin=np.zeros(3),
+            area=-area if last else area,
+            moment=np.zeros((3, 3)),  # without rotation G is zero, and this is not used
+        )
 
     def swept_volume(
         self, mu: Amplitudes
@@ -280,12 +287,14 @@ class Lid:
         slopes = dict.fromkeys(rates, 0.0)
         curvatures = dict.fromkeys(second_rates, 0.0)
         # cof F is quadratic in tau: two Gauss points, of weight 1/2 each, integrate exactly. The
-        # product rule gives the derivatives; the slope of cof F is 2 cof(F, dF), bilinear.
+        # integrand is cof F times the flux of u, entry by entry. The product rule gives its
+        # derivatives; the change of cof F by dF is 2 cof(F, dF), with the bilinear `_cofactor`.
         for tau in GAUSS_POINTS:
             F = np.eye(3) + tau * displacement[0]
             flux = self._flux(*displacement)
             volume += float((_cofactor(F, F) * flux).sum()) / 2
             for a, (G, s) in rates.items():
+                # the part from the change of cof F, then with that from the change of the flux
                 by_F = 2 * tau * _cofactor(F, G) * flux
                 slopes[a] += float((by_F + _cofactor(F, F) * self._flux(G, s)).sum()) / 2
             for (a, b), second_rate in second_rates.items():
@@ -316,10 +325,11 @@ class Lid:
         """
         rate_a, rate_b = rates
         (G_a, _), (G_b, _), (G, s) = rate_a, rate_b, second_rate
-        # cof F alone is differentiated, once by each amplitude or through the mixed derivative
+        # cof F alone is differentiated: by one amplitude and by the other, and by the mixed
+        # derivative G of its argument
         by_both = 2 * tau**2 * _cofactor(G_a, G_b)
         by_F = (by_both + 2 * tau * _cofactor(F, G)) * flux
-        # cof F by one amplitude, the flux by the other
+        # cof F is differentiated by one amplitude, the flux by the other
         mixed = [
             2 * tau * _cofactor(F, G_a) * self._flux(*rate_b),
             2 * tau * _cofactor(F, G_b) * self._flux(*rate_a),
@@ -360,22 +370,25 @@ class EdgePressure:
 
     def swept_volume(self, mu: Amplitudes) -> float:
         """Return the volume that the lids sweep."""
-        return sum(lid.swept_volume(mu)[0] for lid in self.lids)
+        of_lids = (lid.swept_volume(mu) for lid in self.lids)
+        return sum(volume for volume, _, _ in of_lids)
 
     def volume_slope(self, mu: Amplitudes, name: str) -> float:
         """Return the derivative of the swept volume by an amplitude."""
-        return sum(lid.swept_volume(mu)[1].get(name, 0.0) for lid in self.lids)
+        of_lids = (lid.swept_volume(mu) for lid in self.lids)
+        return sum(slopes.get(name, 0.0) for _, slopes, _ in of_lids)
 
     def volume_curvature(self, mu: Amplitudes, name: str, other: str) -> float:
         """Return the second derivative of the swept volume by two amplitudes."""
-        return sum(lid.swept_volume(mu)[2].get((name, other), 0.0) for lid in self.lids)
+        of_lids = (lid.swept_volume(mu) for lid in self.lids)
+        return sum(curvatures.get((name, other), 0.0) for _, _, curvatures in of_lids)
 
     def edge_forces(self, x0: Array, u: Array) -> Array:
         """Return nodal forces (nodes, 3) of the unit pressure on the moving edges.
 
-        The forces that the derivative of the swept volume has are left out. An edge that moves
-        straight by u sweeps a ribbon. Where a node moves further by v, the volume between the two
-        ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
+        The forces that the derivative of the swept volume gives are not part of them. An edge that
+        moves straight by u sweeps a ribbon. Where a node moves further by v, the volume between the
+        two ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
 
         Parameters
         ----------
@@ -442,6 +455,10 @@ class PrescribedMotion:
         Names of the amplitudes of all motions.
     cells
         (local cells,): whether a node of the cell moves.
+
+    Private fields: `_axes` are the axes of a node's components, two in a meridian, three in space.
+    `_places` has for each body the places (dofs, 3) of the nodes of its prescribed components. A
+    degree of freedom is numbered by node, then component. `_r0` and `_bodies` are the parameters.
     """
 
     def __init__(
@@ -450,12 +467,7 @@ class PrescribedMotion:
         bodies: Sequence[RigidBody],
         edge_pressure: EdgePressure | None = None,
     ) -> None:
-        """Find the places of the prescribed components, and the cells with nodes that move.
-
-        A degree of freedom is numbered by node, then component: two in a meridian, three in space.
-        `_axes` are the axes of the components, `_places` for each body the places (dofs, 3) of the
-        nodes of its prescribed components.
-        """
+        """Find the places of the prescribed components, and the cells with nodes that move."""
         self.edge_pressure = edge_pressure
         self._axes = list(AXES_OF_COMPONENTS[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
@@ -501,7 +513,10 @@ class PrescribedMotion:
         return bends
 
     def edge_forces(self, u: Array) -> Array:
-        """Return the forces of the unit pressure on moving edges: `EdgePressure.edge_forces`."""
+        """Return the nodal forces of the unit pressure on edges that move, as a local vector.
+
+        They are zero without a live pressure there.
+        """
         if not (self.edge_pressure and self.edge_pressure.curves):
             return np.zeros_like(u)
         x0 = self._r0.x.array.reshape(-1, 3)
@@ -556,7 +571,7 @@ class PrescribedMotion:
         vectors
             (n, 3): one for each of the body's n prescribed degrees of freedom.
         """
-        axes = np.array(self._axes)[body.dofs % len(self._axes)]
+        axes = np.array(self._axes)[body.dofs % len(self._axes)]  # of each degree of freedom
         return np.asarray(vectors[np.arange(len(axes)), axes])
 
 

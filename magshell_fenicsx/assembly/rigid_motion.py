@@ -55,6 +55,7 @@ class RigidMotion:
         x, y, z = self.turn / (angle or 1.0)
         N = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         NN, c, s = N @ N, np.cos(mu * angle), np.sin(mu * angle)
+        # the rotation, and its first and second derivative by mu
         return (
             np.eye(3) + s * N + (1 - c) * NN,
             angle * (c * N + s * NN),
@@ -99,11 +100,12 @@ def apply_motions(motions: Sequence[RigidMotion], mu: Mapping[str, float], x: Ar
         # the transposed rotation and its first two derivatives by this amplitude
         Q, Q1, Q2 = (matrix.T for matrix in motion.rotation(mu[motion.name]))
         name, arm = motion.name, x - motion.centre
-        # second derivatives: by two earlier amplitudes, and by an earlier one and this one
+        # this motion turns the derivatives by two earlier amplitudes
         curvatures = {pair: derivative @ Q for pair, derivative in curvatures.items()}
+        # second derivatives by an earlier amplitude and this one, in both orders
         for earlier_name, derivative in slopes.items():
             curvatures[earlier_name, name] = curvatures[name, earlier_name] = derivative @ Q1
-        # first derivatives by earlier amplitudes
+        # it turns the first derivatives by earlier amplitudes, too
         slopes = {earlier_name: derivative @ Q for earlier_name, derivative in slopes.items()}
         # derivatives by this amplitude alone
         slopes[name] = arm @ Q1 + motion.shift

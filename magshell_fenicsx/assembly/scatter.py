@@ -66,15 +66,18 @@ class SparsityPattern:
         self.owned, self._comm = n, comm
         own_nodes = np.arange(n, dtype=np.int32)
         numbers = nodes.local_to_global(np.arange(n + ghosts, dtype=np.int32))
+        # i, j: local nodes of the row and the column of each block, the diagonal ones first
         pairs = zip((own_nodes, own_nodes), *coupled, strict=True)
         i, j = (np.concatenate(nodes_of_pairs) for nodes_of_pairs in pairs)
-        # blocks in the rows of ghosts go to the owners of these, as local rows and columns
+        # blocks in the rows of ghosts, as local rows and columns, go to the owners of the ghosts;
+        # blocks of others come, as global rows and columns
         sent = self._blocks_to_send(nodes, i, j)
         self._received_counts = np.array(comm.alltoall(list(self._sent_counts)))
         received_rows, received_nodes = (
             self._exchange(numbers[local_nodes], size=1) for local_nodes in sent
         )
-        # all nodes of other ranks in own columns; columns are numbered by their position here
+        # `others`: nodes of other ranks that occur in columns. The column of such a node is n + its
+        # position among them, the column of an own node is its local number
         is_foreign = (received_nodes < first_node) | (received_nodes >= first_node + n)
         self.others = np.unique(np.concatenate([numbers[n:], received_nodes[is_foreign]]))
         received_columns = np.where(
@@ -85,14 +88,15 @@ class SparsityPattern:
         ghost_columns = n + np.searchsorted(self.others, numbers[n:])
         self._columns_of_nodes = np.concatenate([own_nodes, ghost_columns]).astype(np.int32)
         self._width = n + len(self.others)
-        # the blocks of this rank's cells and those that others send, each once
+        # rows and columns in the pattern, of the blocks of this rank's cells and of those that
+        # others send; each block is kept once
         received_blocks = self._row(received_rows - first_node, received_columns), received_columns
         all_positions = zip(self._position(i, j), received_blocks, strict=True)
         rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in all_positions)
         del i, j  # large
         blocks = _unique_positions(rows, columns, (2 * n + ghosts, self._width))
         self.starts, self.columns = blocks.indptr, blocks.indices
-        # keys row * width + column ascend, so that a search finds each block
+        # a block has the key row * width + column; the keys ascend, so that a search finds a block
         block_rows = np.repeat(np.arange(2 * n + ghosts), np.diff(self.starts))
         self._keys = block_rows * self._width + self.columns
         self._sent_entries = self._entries(*self._position(*sent)).ravel()
@@ -138,9 +142,8 @@ class SparsityPattern:
         values
             (9 blocks,): the values in the order of the pattern, which are changed.
         """
-        np.add.at(
-            values, self._received_entries, self._exchange(values[self._sent_entries], size=9)
-        )
+        received = self._exchange(values[self._sent_entries], size=9)
+        np.add.at(values, self._received_entries, received)
 
     def csr(self, first: int, last: int) -> tuple[Ints, Ints]:
         """Return rows of blocks, from `first` up to `last`, as scalar compressed sparse rows.
@@ -152,6 +155,7 @@ class SparsityPattern:
         """
         starts = self.starts[first : last + 1]
         columns = self.columns[starts[0] : starts[-1]]
+        # SciPy expands blocks (3, 3), whose values do not matter, to scalar rows
         values = np.zeros((len(columns), 3, 3), dtype=np.int8)
         shape = (3 * (last - first), 3 * self._width)
         rows = scipy.sparse.bsr_array((values, columns, starts - starts[0]), shape=shape).tocsr()
@@ -163,20 +167,23 @@ class SparsityPattern:
         return self._row(i, columns), columns
 
     def _row(self, i: Any, columns: Any) -> Any:
-        """Return the row of blocks of local nodes: n further down beside nodes of other ranks.
+        """Return the rows of blocks in the pattern: n further down in columns of other ranks.
 
         Parameters
         ----------
+        i
+            Local nodes of the rows.
         columns
             Columns of the blocks in the pattern.
         """
+        # true counts as 1: rows of ghosts follow n further down, too
         return i + self.owned * ((i >= self.owned) | (columns >= self.owned))
 
     def _find(self, rows: Any, columns: Any) -> Ints:
         """Return the numbers of the blocks at rows and columns; -1 for a missing block."""
         keys = rows * np.int64(self._width) + columns
-        # where each key would be inserted: at the same key if its block exists; a key beyond all
-        # others is compared with the last one
+        # where each key would be inserted: at the same key if its block exists. A key beyond all
+        # others gets the position of the last one
         positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[positions] == keys, positions, -1).astype(np.int32)
 
@@ -185,12 +192,12 @@ class SparsityPattern:
 
         A row of b blocks has three scalar rows of 3 b values each.
         """
-        # 9 values for each block before the row, then 3 for each earlier block of its first scalar
-        # row: 9 start + 3 (block - start)
+        # the first value of the block: behind 9 values of each block before the row, and 3 of each
+        # earlier block in the first scalar row, 9 start + 3 (block - start)
         row_start = self.starts[rows].astype(np.int64)
         first_entry = 6 * row_start + 3 * self._find(rows, columns)
         scalar_row_length = 3 * (self.starts[rows + 1] - self.starts[rows])
-        # the components of row and column of a value within its block
+        # a value at the components c, d of its block is c scalar rows and d values further
         c, d = np.arange(3)[:, None], np.arange(3)
         return np.asarray(first_entry[:, None, None] + c * scalar_row_length[:, None, None] + d)
 
@@ -246,8 +253,10 @@ class BlockMatrix:
     collective.
 
     Private fields: `_cells` has the nodes of each cell, `_coupled` those of the two cells of each
-    pair, by batch. `_blocks` and `_coupling_blocks` are the numbers of their blocks. `_values` are
-    all values; `_zeros` and `_ones` tell where clamped unknowns have 0 and 1.
+    pair, by batch. `_blocks` and `_coupling_blocks` are the numbers of their blocks in `_pattern`.
+    `_values` are all values; `_zeros` and `_ones` tell where clamped unknowns have 0 and 1.
+    `_fully_clamped` tells which local nodes have no free unknown. `_K` is the matrix of PETSc,
+    `_lib` and `_ffi` are the C functions and cffi's interface to them.
 
     Parameters
     ----------
@@ -270,15 +279,17 @@ class BlockMatrix:
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         source = Path(__file__).with_name("scatter.c")
         self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
+        # nodes of the cells, and of both cells of each coupled pair
         self._cells = np.ascontiguousarray(V.dofmap.list)
         self._coupled = [(self._cells[rows], self._cells[columns]) for rows, columns in coupled]
         is_clamped = np.zeros((nodes.size_local + nodes.num_ghosts, 3), dtype=bool)
         for bc in clamped:
             is_clamped.ravel()[bc.dof_indices()[0]] = True
         self._fully_clamped = np.array(is_clamped.all(axis=1))
+        # the pattern of blocks, and the numbers of the blocks of each cell in it
         self._pattern = pattern = SparsityPattern(nodes, self._free_pairs(), comm)
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
-        # of each pair of coupled cells in both orders
+        # for each pair of coupled cells the blocks of its nodes, in both orders of the cells
         self._coupling_blocks = [
             np.stack(
                 [pattern.blocks(*_pairs(rows, columns)), pattern.blocks(*_pairs(columns, rows))],
@@ -286,6 +297,7 @@ class BlockMatrix:
             )
             for rows, columns in self._coupled
         ]
+        # places of values that clamped unknowns fix at 0 and at 1
         self._zeros, self._ones = self._clamped_entries(is_clamped)
         self._values = np.zeros(9 * int(pattern.starts[-1]))
         self._K = self._create_matrix(comm)
@@ -360,6 +372,7 @@ class BlockMatrix:
         """
 
         def pointer(x: NDArray[np.float64] | Ints) -> object:
+            """Return the address of an array for C."""
             assert x.flags.c_contiguous
             return self._ffi.from_buffer("double[]" if x.dtype == np.float64 else "int32_t[]", x)
 
@@ -402,7 +415,8 @@ class BlockMatrix:
         """
         count, owned = len(is_clamped), self._pattern.owned
         has_clamped, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
-        # a pair i, j of nodes as the number i * count + j; first the diagonal blocks of own nodes
+        # pairs i, j of nodes with a clamped unknown, as numbers i * count + j: first the diagonal
+        # blocks of own nodes, i = j
         keys = [own_nodes[has_clamped[own_nodes]] * (count + np.int64(1))]
         for i, j in self._free_pairs():
             is_affected = has_clamped[i] | has_clamped[j]

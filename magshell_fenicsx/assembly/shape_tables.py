@@ -82,14 +82,24 @@ class ShapeTable:
         """
         a, b = self.triangle
         D = self.values
-        # (i < j) is 1 for two different derivatives
+        # (i < j) is 1 for two different derivatives and 0 for i = j: the second product is left out
         products = [D[:, i, a] * D[:, j, b] + (i < j) * D[:, j, a] * D[:, i, b] for i, j in pairs]
         return _flat(w, products)
 
     def skew(self, w: Array, pairs: tuple[IndexPair, ...]) -> Array:
         """Return w (D_i[a] D_j[b] - D_j[a] D_i[b]) of functions a <= b.
 
-        The shape is (points * pairs, functions (functions + 1)/2).
+        Parameters
+        ----------
+        w
+            (points,): weights.
+        pairs
+            The pairs i < j of derivatives, by their numbers in the table, 0 to 5.
+
+        Returns
+        -------
+        Array
+            (points * pairs, functions (functions + 1)/2).
         """
         a, b = self.triangle
         D = self.values
@@ -137,7 +147,7 @@ def cell_rule(degree: int) -> tuple[Array, Array]:
 
 
 def edge_rule(degree: int, edge: int, is_reversed: bool) -> tuple[Array, Array]:
-    """Return a quadrature rule on an edge of the reference triangle.
+    """Return a quadrature rule of a degree on an edge of the reference triangle.
 
     Parameters
     ----------
@@ -151,7 +161,7 @@ def edge_rule(degree: int, edge: int, is_reversed: bool) -> tuple[Array, Array]:
     Points (q, 2), and weights (q,) that sum to one.
     """
     x, weights = basix.make_quadrature(basix.CellType.interval, degree)
-    # backwards if reversed
+    # the corners between which the points run, in reverse order if reversed
     start, end = CORNERS[list(EDGES[edge][:: -1 if is_reversed else 1])]
     return start + np.asarray(x) * (end - start), np.asarray(weights)
 
@@ -167,7 +177,7 @@ def edge_covector(edge: int) -> Array:
     start, end = CORNERS[list(EDGES[edge])]
     tangent = end - start
     covector = np.array([tangent[1], -tangent[0]])
-    # outward: negative towards the centre
+    # its value along the way from the edge to the centre must be negative
     return covector if covector @ (CORNERS.mean(axis=0) - start) < 0 else -covector
 
 
@@ -185,7 +195,8 @@ def cell_frames(domain: mesh.Mesh) -> Array:
     corners = domain.geometry.x[compat.geometry_dofs(domain)]
     first_edge, second_edge = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(first_edge, axis=1)
-    # along x; y is normal to it in the plane of the triangle
+    # unit vector of x; y is normal to it in the plane of the triangle. The second edge has the
+    # components (second_along_first, height)
     direction = first_edge / length[:, None]
     second_along_first = np.einsum("ci,ci->c", second_edge, direction)
     height = np.linalg.norm(second_edge - second_along_first[:, None] * direction, axis=1)
@@ -214,7 +225,7 @@ class PointSampling:
     def __init__(self, table: ShapeTable, weights: Array, derivatives: Sequence[int]) -> None:
         D, identity = table.values[:, list(derivatives)], np.eye(3)
         size = 3 * D.shape[2]
-        # q point, p derivative, f function; c and d components, of node and of value
+        # indices: q point, p derivative, f function, c component of the node, d of the value
         self._to_points = np.einsum("qpf,cd->fcqpd", D, identity).reshape(size, -1)
         self._to_nodes = np.einsum("q,qpf,cd->qpdfc", weights, D, identity).reshape(-1, size)
 

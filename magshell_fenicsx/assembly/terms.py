@@ -101,7 +101,9 @@ class FormTerm:
         The skew part that the symmetric tangent lacks; None for a potential.
 
     The private field `_factor` is a constant in all forms but that of the energy; it is set before
-    each assembly.
+    each assembly. `_u` is the displacement, `_work` the virtual work or None. `_requested_energy`,
+    `_requested_residual` and `_requested_tangent` return the compiled forms; to read them requests
+    the compilation.
     """
 
     def __init__(
@@ -163,6 +165,7 @@ class FormTerm:
             return None
 
         def skew() -> ufl.Form:
+            """Return half the difference of the derivative and its transpose."""
             hessian = self._hessian
             return self._factor / 2 * (hessian - ufl.adjoint(hessian))
 
@@ -247,6 +250,9 @@ class AngleTerm(FormTerm):
     The angle goes on beyond half a turn, while forms know no turns. So the energy is that of the
     angle nearest to `value`, a reference angle that stands in the state: it is a function of the
     state.
+
+    Private fields: `_reference_angle` is `value`, `_cosine_and_sine` the constant in the form that
+    follows from it, `_moment` is -Pi of one radian.
     """
 
     def set_reference_turn(self, cosine_and_sine: fem.Constant, moment: float) -> None:
@@ -255,8 +261,8 @@ class AngleTerm(FormTerm):
         Parameters
         ----------
         cosine_and_sine
-            (2,): cosine and sine of the reference angle, a constant in the form; see
-            `edges.turning`.
+            (2,): cosine and sine of the reference angle, a constant in the form, which measures
+            angles from there.
         moment
             Intensity times the edge's length: -Pi of one radian.
         """
@@ -282,6 +288,7 @@ class AngleTerm(FormTerm):
 
     def energy(self) -> float:
         """Return Pi(u), this rank's part."""
+        # the form has the angle beyond the reference; the rest counts once, on the first rank
         reference = self._reference_angle * self._moment if self._comm.rank == 0 else 0.0
         return super().energy() - reference
 

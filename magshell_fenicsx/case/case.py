@@ -166,7 +166,7 @@ class Case(WithParts):
     def with_shells(self, parts: Sequence[MemberCase]) -> Self:
         """Return a copy of a case of several shells, whose imperfections have changed.
 
-        `parts` are in the order of the file; joints and pairs remain.
+        `parts` are the changed shells in the order of the file; joints and pairs remain.
         """
         assert self.several
         several = SeveralShells(parts, self.several.joints, self.several.pairs)
@@ -241,8 +241,11 @@ class Case(WithParts):
 
         Raises
         ------
-        CaseError, MeshError
-            See `make_problem`.
+        CaseError
+            If the requested symmetry is not there, or the case asks for something that cannot be
+            built.
+        MeshError
+            If a support or a load names an edge or a point that the meridian does not have.
         """
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
@@ -287,7 +290,7 @@ class Case(WithParts):
         """Sections, units and steps of the case, in the form that its parts read."""
         sections = {key: getattr(self, key) for key in type(self).model_fields}
         sections["imperfections"] = self.imperfections
-        # load steps are planned with the rest of the context, which comes first
+        # load steps are planned from a context without them, which then gets them
         is_programme, is_solid = isinstance(self.loading, list), self.model == "solid"
         without_steps = Context(
             self.shell, self.points, sections, is_programme=is_programme, solid=is_solid
@@ -359,7 +362,7 @@ class Case(WithParts):
 
     @property
     def time_unit(self) -> float | None:
-        """Unit of time in s, see `Context.time_unit`."""
+        """The unit R √(ρ/E) of times, in s where the case has units; None without density."""
         return self.context.time_unit
 
     @property
@@ -410,7 +413,8 @@ class Case(WithParts):
         Raises
         ------
         CaseError
-            See `load`; for a mapping the message begins with the key.
+            One message with every mistake: file, line, key, value, what is allowed; for a mapping
+            it begins with the key.
         """
         if not isinstance(source, Source):  # a mapping has no file: messages begin with the key
             source = Source("case", dict(source))

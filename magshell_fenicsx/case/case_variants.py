@@ -60,7 +60,10 @@ def open_case(
 
 
 def read_together(file: str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Source:
-    """Return the case file as rank 0 reads it, on every rank; collective. See `read_source`."""
+    """Return the case file as rank 0 reads it, on every rank; collective.
+
+    `settings` are `key.path=value` texts that replace values of the file.
+    """
     return on_first_rank(comm, lambda: read_source(Path(file), settings))
 
 
@@ -76,6 +79,7 @@ def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
     # nothing to do on one rank, or where an earlier call has shared the files
     if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
         return case
+    # the case of rank 0 as text, and key -> content of each file as rank 0 reads it
     case_json = case.model_dump_json()
     first_json, contents = on_first_rank(
         comm, lambda: (case_json, {key: _content(reader) for key, reader in readers.items()})
@@ -125,14 +129,15 @@ def _case_with_value(case: Case, key: str, value: Any) -> Case:
 
     A key of the shell changes numbers over which loads are given, so the loading is made again.
     """
-    case_data = case.origin.data
+    case_data = case.origin.data  # None for a case that a program has made
     if case.several and key.split(".")[0] in ("shells", "mesh"):  # all shells are meshed anew
         return _remade_case(case, key, value)
     replaced: Case = _with_value(case, key, value)
     if case_data is None:
         return replaced
-    data = _data_with_value(case, case_data, key, value)  # which the next change builds on
-    if key.startswith("shell."):  # numbers of other sections are no units of further keys
+    # the plain data are changed too: the next change begins with them
+    data = _data_with_value(case, case_data, key, value)
+    if key.startswith("shell."):  # loads may be given over numbers of the shell
         remade = _validated(data, case, key)
         replaced = replaced.model_copy(update={"shell": remade.shell, "loading": remade.loading})
     return replaced.written_as(replace(case.origin, data=data))
@@ -149,14 +154,15 @@ def _remade_case(case: Case, key: str, value: Any) -> Case:
             f"{key}: needs a case that was read from a file or a mapping: see Case.from_source"
         )
     data = _data_with_value(case, case.origin.data, key, value)
+    # the case may have a tolerance and the mesh that was chosen for it; validation would refuse
+    # both together, so that it does not see the tolerance
     tolerance = case.mesh.tolerance
-    # a mesh that the tolerance has chosen is no mistake
     data_to_validate = _data_with_value(case, data, "mesh.tolerance", None) if tolerance else data
     remade = _validated(data_to_validate, case, key).with_terms(case.own_terms)
     kept_names = [name for name in type(case).model_fields if name not in KEYS_OF_SHELLS]
     kept_sections = {name: getattr(case, name) for name in kept_names}
     kept_sections["mesh"] = remade.mesh.model_copy(update={"tolerance": tolerance})
-    if key.startswith("shells."):  # targets are over its numbers
+    if key.startswith("shells."):  # targets of loads may be given over numbers of the shells
         kept_sections["loading"] = remade.loading
     # remanences of shells have been merged into the section `magnetic`
     if any(section.remanent for section in (remade.shells or {}).values()):
@@ -170,7 +176,7 @@ def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) 
     `value` is a number as the validated case has it, such as 0.002 for a length in metres. If the
     data have "1 mm", the result has "2.0 mm".
     """
-    # the section that has the last key, which is a number in a list
+    # the section below which the last key stands; in a list the key is a number
     new_data = deepcopy(dict(data))
     *path, last_key = key.split(".")
     section: Any = new_data
@@ -179,13 +185,15 @@ def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) 
         section = section[int(name)] if is_list else section.setdefault(name, {})
     index: Any = int(last_key) if isinstance(section, list) else last_key
     previous = section[index] if isinstance(section, list) else section.get(index)
+    # the previous value, such as "1 mm", as the texts of its number and its unit
     number, unit = number_and_unit(previous) if isinstance(previous, str) else ("", "")
     if not unit or value is None:
         section[index] = value
         return new_data
+    # the size of the unit in numbers of the validated case. It is not always the SI size, because
+    # validation may divide a number by h or by a width. So it is found from the current value; if
+    # that is zero, from a trial with the value 1
     size_of_unit, current = si_size(unit), _number_at(case, key)
-    # validation may divide a number by h or by a width. So the size of the unit in the validated
-    # case is found from the current value; if that is zero, from a trial with the value 1
     if current and float(number):
         size_of_unit = current / float(number)
     elif current is not None:
@@ -274,6 +282,7 @@ def perfect_case(case: Case) -> Case:
     )
     if not case.several:
         return perfect
+    # of several shells each has a section, and a case of its own: both lose the imperfections
     perfect_shells = []
     for member in case.several.parts:
         section_shell = _without_imperfections(member.section.shell)
@@ -295,13 +304,14 @@ def _without_imperfections(shell: Surface | ShellSection) -> Surface | ShellSect
 def _to_the_limit(case: Case) -> Any:
     """Return the loading of the perfect shell, which ends at its first instability.
 
-    None if no load of the case remains. `on_perfect` gives a step for the perfect shell, or None
-    where it has none, as the growth of an imperfection; with `last` the step goes to the first
-    instability.
+    It is None if no load of the case remains. `on_perfect` returns a step for the perfect shell. It
+    returns None for a step that the perfect shell does not have, such as the growth of an
+    imperfection. With `last` the step goes to the first instability.
     """
     loading = case.loading
     if not isinstance(loading, list):
         return loading and loading.on_perfect(last=True)
     steps = [step.on_perfect(last=False) for step in loading]
     loads = [load for load in steps if load is not None]
+    # the last one that remains goes to the first instability
     return [*loads[:-1], *(load.on_perfect(last=True) for load in loads[-1:])] or None

@@ -49,7 +49,7 @@ def _description(case: Case, problem: Problem) -> str:
 
     Raises CaseError if nothing holds the shell or the memory is too small.
     """
-    # with a tolerance the mesh, and so the memory, is known in the run alone
+    # with a tolerance for the result, the run finds the mesh: only then the memory is known
     memory_warning = None if case.mesh.tolerance else refuse_beyond_memory(problem)
     _refuse_unsupported(problem)
     lines = _number_lines(case, problem)
@@ -62,7 +62,7 @@ def _description(case: Case, problem: Problem) -> str:
             "mesh: found by the run, for a relative error of its result below "
             f"{case.mesh.tolerance:g}"
         )
-    # what the model lacks, and what other commands alone do
+    # what the model leaves out, and sections of the case that only other commands read
     left_out = list(problem.left_out)
     edges = _edges_without_potential(problem, patch) if problem.loads.pressure else ()
     if edges:
@@ -110,7 +110,7 @@ def _number_lines(case: Case, problem: Problem) -> list[str]:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / material.h,
     }
-    # p_c is of spheres, and the unit of pressures
+    # p_c is left out for a flat shell, unless it is the unit of a pressure
     is_flat = case.context.shell.geometry in FLAT_GEOMETRIES and not problem.loads.pressure
     if is_flat:
         del numbers["p_c/E"]
@@ -142,9 +142,9 @@ def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
 
 
 def _in_units(case: Case, without: str) -> list[str]:
-    """Return lines with the scales of a case in units, but for the scale `without`.
+    """Return lines with the scales of a case in units, such as "h = 0.2 mm".
 
-    There are none for a case without units.
+    The scale `without` is left out. There are no lines for a case without units.
     """
     sizes = sizes_of(case.context)
     words_and_units = {  # scale -> words and unit of its size
@@ -171,10 +171,11 @@ def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple
     `patch` is the triangulation, if it is made already.
     """
     span = problem.meridian
-    if span is None:  # a triangulated surface, or else a meridian
+    if span is None:  # a triangulated surface
         return open_edges(
             patch or problem.triangulated(), problem.conditions, problem.loads.pressed_sides
         )
+    # a meridian: its openings with a potential, and the names of the edges without one
     _, without_potential = ring_openings(
         span.ends(), problem.conditions, problem.loads.pressed_sides
     )
@@ -210,23 +211,25 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     if patch is None:
         assert problem.meridian
         chart = problem.meridian
-        # joined meridians share a vertex, and count as one piece
+        # meridians that are joined end to end share a vertex, and count as one piece
         joined_count = sum(first == second for first, second in chart.joints)
         piece_count = max(len(chart.shell_meridians) - joined_count, 1)
         count = len(meridian_vertices(problem)) - piece_count
-        # two components, at the nodes of cells and one more for each piece
+        # two components at each node; a piece has one node more than degree times its cells
         return count, 2 * (degree * count + piece_count)
     cell_count, corner_count = len(patch.corners), len(np.unique(patch.corners))
     # the two corners of each side, smaller number first: a side of two cells counts once
     sides = np.sort(patch.corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     side_count = len(np.unique(sides, axis=0))
-    if problem.body:  # three hexahedra a layer above each triangle
+    if problem.body:
+        # a solid: each triangle is divided into three quadrilaterals, and above it each layer has
+        # three hexahedra of degree two
         layers = len(problem.body.layer_bounds) - 1
-        # nodes of degree two: of a triangle in three quadrilaterals there are three within each
-        # side and seven inside, in two planes for each layer and one more; three components
+        # nodes of one plane: at corners, three within each side, seven inside each triangle. There
+        # are two planes for each layer, and one more; nodes have three components
         nodes_in_plane = corner_count + 3 * side_count + 7 * cell_count
         return 3 * cell_count * layers, 3 * (2 * layers + 1) * nodes_in_plane
-    # three components at corners, within sides and within cells
+    # a shell: nodes at corners, within sides and within cells, of three components
     nodes_in_cell = (degree - 1) * (degree - 2) // 2
     nodes = corner_count + (degree - 1) * side_count + nodes_in_cell * cell_count
     return cell_count, 3 * nodes

@@ -76,7 +76,7 @@ class CoaxialShell:
 
     @property
     def wave_measure(self) -> float:
-        """Measure of the largest wave number around e3, see `shells.waves.Waves`.
+        """Measure of the largest number of waves around e3 in which the shell may buckle.
 
         Buckles are about as long as the root of thickness over curvature. So their number grows
         with the largest distance from the axis over that length.
@@ -86,8 +86,9 @@ class CoaxialShell:
 
     def own_parameter(self, s: Array) -> Array:
         """Return the shell's own parameters, clipped to its meridian, from common ones (n,)."""
-        t = (s - self.start) / self.place.scale  # from the start of the shell
-        return np.clip(t if self.upright else self.chart.length - t, 0.0, self.chart.length)
+        from_start = (s - self.start) / self.place.scale  # over the shell's own length
+        own_s = from_start if self.upright else self.chart.length - from_start
+        return np.clip(own_s, 0.0, self.chart.length)
 
     def parameter(self, own_parameter: Array) -> Array:
         """Return the common parameter from the shell's own parameters (n,)."""
@@ -97,6 +98,7 @@ class CoaxialShell:
     def places_at(self, s: Array) -> Array:
         """Return places (n, 3) in the plane of e1 and e3, at common parameters (n,)."""
         own_s = self.own_parameter(s)
+        # charts (parameter, 0), then places in the shell's own frame and length
         places = self.chart.embedding(np.column_stack([own_s, 0 * own_s]))
         return self._in_common_frame(self.place.scale * places) + self._translation
 
@@ -115,7 +117,8 @@ class CoaxialShell:
 
     def foot(self, x: Array) -> tuple[float, float]:
         """Return common parameter and azimuth (rad) of the shell's place nearest to x (3,)."""
-        in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])  # without a shell's number
+        # a node of a mesh has the number of its shell as fourth entry, which is left out
+        in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])
         own_s, _ = self.chart.locate(self.outline.inverse(in_shell_frame))
         return float(self.parameter(np.array(own_s))), float(np.arctan2(x[1], x[0]))
 
@@ -231,7 +234,8 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
     successors = _successors(shells, several.joints)
     if isinstance(successors, str):
         return successors
-    # vertices at T-junctions: there the second name of a joint is that of a shell, not of an edge
+    # at T-junctions a shell needs vertices where edges of others stand on it: there the second name
+    # of a joint is that of the shell, not of an edge
     places = dict(name_and_place for shell in shells for name_and_place in shell.places)
     with_feet = []
     for shell in shells:
@@ -273,16 +277,18 @@ def _successors(
 ) -> dict[str, str] | str:
     """Return the order of joined shells: name of a shell -> name of the one that follows it.
 
-    The next shell begins where this one ends, and is joined to it there. The result is a reason in
-    words if two shells cannot be joined end to beginning.
+    `joints` are pairs of names of edges, in a T-junction of an edge and a shell. The next shell
+    begins where this one ends, and is joined to it there. The result is a reason in words if two
+    shells cannot be joined end to beginning.
     """
     # name of an edge -> (side, its place, its shell); the side is 0 at the beginning of the shell
-    # along the common parameter, 1 at its end
+    # in the common parameter, 1 at its end
     edges = {
         name: (side, place, shell)
         for shell in shells
         for side, (name, place) in enumerate(shell.places)
     }
+    # the size of all shells, which scales the distance at which edges meet; they begin at 0 here
     samples = [shell.places_at(shell.end * np.arange(101.0) / 100) for shell in shells]
     extent = np.ptp(np.vstack(samples), axis=0).max()
     successors = dict[str, str]()
@@ -371,15 +377,17 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
     several
         The shells of the case, with their joints.
     """
+    # names: of the shells by their numbers in the case
     joints, names = several.joints, [member.name for member in several.parts]
     by_name = {shell.name: shell for shell in shells}
-    # of joints end to end; at a T-junction the second name is that of a shell
+    # names of ends that are joined to each other; at a T-junction, which is left out, the second
+    # name is that of a shell
     joined_ends = {name for joint in joints if joint[1] not in by_name for name in joint}
-    # where the parameters that count as those of a shell begin, see `CoaxialEmbedding`
-    begins = []
-    for shell in shells:
-        is_joined = shell.names[0] in joined_ends
-        begins.append(shell.start - (0 if is_joined else PARAMETER_GAP / 2))
+    # where the parameters that count as those of a shell begin: half of a gap belongs to each shell
+    begins = [
+        shell.start - (0 if shell.names[0] in joined_ends else PARAMETER_GAP / 2)
+        for shell in shells
+    ]
     embedding = CoaxialEmbedding(shells, np.array(begins))
 
     def locate(x: Array) -> tuple[float, float]:
@@ -389,15 +397,9 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         """
         if len(x) > len("xyz"):
             return by_name[names[round(float(x[-1]))]].foot(x)
-        in_plane = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
-        # of a place the nearest foot on any shell counts
-        feet = [shell.foot(x) for shell in shells]
-        distances = [
-            np.linalg.norm(shell.places_at(np.array([s]))[0] - in_plane)
-            for shell, (s, _) in zip(shells, feet, strict=True)
-        ]
-        return feet[int(np.argmin(distances))]
+        return _nearest_foot(shells, x)
 
+    # common parameters and places of all ends by name, and what the chart has of all shells
     parameters, places = dict[str | None, float](), dict[str | None, Array]()
     curvature_jumps, end_names = list[float](), list[str | None]()
     for shell in shells:
@@ -425,7 +427,20 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         shell_meridians=tuple(shell.shell_meridian for shell in shells),
         joints=tuple((parameters[foot], parameter_of(edge, foot)) for foot, edge in joints),
     )
-    # the curvature of all meridians is set so that the measure of waves is the largest of any shell
+    # all meridians share one number as curvature. It is set so that their measure of waves, reach
+    # times the root of curvature over h, is the largest of any shell
     reach, h = max(1.0, float(chart.sample()[:, 0].max())), shells[0].problem.material.h
     waves = max(shell.wave_measure for shell in shells)
     return replace(chart, curvature=h * (waves / reach) ** 2)
+
+
+def _nearest_foot(shells: Sequence[CoaxialShell], x: Array) -> tuple[float, float]:
+    """Return common parameter and azimuth (rad) of the place of any shell nearest to x (3,)."""
+    in_plane = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
+    # the nearest place of each shell, and its distance in the plane of the meridians
+    feet = [shell.foot(x) for shell in shells]
+    distances = [
+        np.linalg.norm(shell.places_at(np.array([s]))[0] - in_plane)
+        for shell, (s, _) in zip(shells, feet, strict=True)
+    ]
+    return feet[int(np.argmin(distances))]

@@ -85,6 +85,7 @@ def contact_places(
     for a, b in all_pairs if all_may_touch else pairs:
         if a == b or a not in places or b not in places:
             continue
+        # the gap at each place of one shell to the other, and the number of the nearest place there
         gaps_a, nearest_in_b = _gaps(places[a], places[b], half_thickness[a], half_thickness[b])
         gaps_b, _ = _gaps(places[b], places[a], half_thickness[b], half_thickness[a])
         # the pair of places with the least gap of all
@@ -94,10 +95,10 @@ def contact_places(
         # shells of which all places with nearly the least gap are close together
         with_one_place = []
         for name, gaps in ((a, gaps_a), (b, gaps_b)):
-            is_similar = gaps < gaps_a.min() + GAP_TOLERANCE * mean_thickness[name]
-            offsets = places[name][is_similar] - nearest_places[name]
-            if np.linalg.norm(offsets, axis=1).max() < one_place_distance[name]:
+            similar = places[name][gaps < gaps_a.min() + GAP_TOLERANCE * mean_thickness[name]]
+            if _extent(similar, nearest_places[name]) < one_place_distance[name]:
                 with_one_place.append(name)
+        # the two places were samples; charts of both shells make them exact
         if with_one_place and a in charted and b in charted:
             exact_a, exact_b = _nearest(
                 nearest_places[a], nearest_places[b], charted[a], charted[b]
@@ -108,6 +109,11 @@ def contact_places(
             if distance < MAX_GAP * mean_thickness[name]:
                 places_of_contact[name].append(nearest_places[name])
     return places_of_contact
+
+
+def _extent(places: Array, centre: Array) -> float:
+    """Return the largest distance of places (n, 3) from a place (3,)."""
+    return float(np.linalg.norm(places - centre, axis=1).max())
 
 
 def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDArray[np.int64]]:
@@ -127,7 +133,8 @@ def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDAr
     numbers
         (n,) of the places y with these nearest faces.
     """
-    # where the thickness is uniform, the nearest mid-surface has the nearest face
+    # where the thickness is uniform, the nearest mid-surface has the nearest face; else one of the
+    # nearest mid-surfaces has it
     candidate_count = min(FACE_CANDIDATES if np.ptp(half_y) else 1, len(y))
     # (n, candidates): for each x the nearest places y, by their mid-surfaces
     distances, candidates = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + candidate_count))
@@ -195,7 +202,8 @@ def _nearest(x: Array, y: Array, of_x: ChartedShell, of_y: ChartedShell) -> tupl
 
     # both charts are sought together, as one vector (4,)
     start = np.concatenate([of_x.chart(x), of_y.chart(y)])
-    # a varying thickness enters the gap; otherwise the distance alone is a least-squares problem
+    # where the thickness varies, the gap itself is made least; else the distance of the
+    # mid-surfaces, which is a least-squares problem
     if of_x.half or of_y.half:
         charts = scipy.optimize.minimize(gap, start).x
     else:

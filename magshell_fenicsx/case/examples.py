@@ -33,7 +33,7 @@ def write_example(name: str, file: Path | None = None) -> list[Path]:
     Parameters
     ----------
     name
-        Name of the example, see `examples`.
+        Name of the example: that of its file, without the ending.
     file
         File to write; by default NAME.yaml in the working folder.
 
@@ -65,8 +65,8 @@ def _text(file: Path) -> str:
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
     """Return path -> content of the files of an example.
 
-    They are the case, and its mesh file or data file. For an example of `identify`, the cases and
-    data that it predicts come too.
+    They are the case, and its mesh file or data file. An example of `identify` may name further
+    cases with their data, below `predict`; these come too.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
     text, case_data = _text(source), read_source(source).data
     mesh = (case_data.get("shell") or {}).get("file")  # name of a mesh file, or None
     data_file = source.with_suffix(".csv")
-    # only an example of `identify` has data: a table with its own name
+    # only an example of `identify` has data: a table with the example's name
     if data_file.exists():
         predicted = (case_data.get("identify") or {}).get("predict") or {}
         names = list[str]()

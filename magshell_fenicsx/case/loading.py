@@ -56,6 +56,7 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     """
     implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):  # in a list the author has written all steps
+        # pairs (key, load): natural shape and field, as far as the case has them
         implied_steps = [
             pair
             for kind in KINDS_BEFORE_LOAD
@@ -67,7 +68,8 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     steps = []
     for number, (key, load) in enumerate(keyed_loads, 1):
         name = load.name_in(context, loads)
-        # loads of one kind at different places have amplitudes with numbers: force, force_2, ...
+        # without a name of its own a step has that of its amplitude. Loads of one kind at different
+        # places get numbers: force, force_2, ...
         if name is None:
             places = places_of_amplitude.setdefault(load.amplitude, [])
             if load.place not in places:
@@ -89,12 +91,16 @@ def refuse_unfit_steps(context: Context) -> None:
     for step in context.steps:
         load, key = step.load, step.key
         load.refuse_unfit(step, context)
+        # the first step that drives an amplitude begins at zero, so that its goal must not be zero
         goal = load.target or load.limit_target  # (what is prescribed, its value at the end)
-        if step.name not in context.driven_before(step.number) and goal and goal[1] == 0:
+        _, goal_value = goal or (None, None)
+        if step.name not in context.driven_before(step.number) and goal_value == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the "
                 "first step of a load begins there"
             )
+        # a static step needs equilibrium at its begin: after a motion the shell must have come to
+        # rest
         earlier_steps = context.steps_before(step.number)
         if earlier_steps and not earlier_steps[-1].load.rests and not load.in_time:
             kind = earlier_steps[-1].kind
@@ -110,7 +116,7 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
 
     `steps` are all steps of the programme, whose amplitudes a step may hold.
     """
-    # amplitude -> its step; a pressure can be held even where no step applies one
+    # amplitude -> the load that drives it; a pressure can be held even where no step applies one
     holdable_loads: dict[str, Step | None] = {"pressure": None}
     holdable_loads |= {any_step.name: any_step.load for any_step in steps if any_step.load.holdable}
     if step.load.in_time:  # its amplitude is the time
@@ -121,31 +127,48 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
     names = sorted(set(holdable_loads) - refused_names)
     allowed = ", ".join(names) or "none"
     for name, manner in step.load.hold.items():
-        # whether the step may hold this amplitude at all, then whether it may hold its conjugate
         key = f"{step.key}.hold.{name}"
         holds_conjugate = manner == "conjugate"
+        # the step's own amplitude: its conjugate alone, on a way to an instability without an end
         if name == step.name and not (to_limit and holds_conjugate):
             raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
         if name == step.name and step.load.limit_target:
             raise ValueError(
                 f"{key}: conjugate: the way to the instability has no end: leave out the target"
             )
+        # any amplitude, and a gas for the pressure alone
         if name not in holdable_loads:
             raise ValueError(f"{key}: the programme has no such amplitude; allowed: {allowed}")
         if isinstance(manner, Gas) and name != "pressure":
             raise ValueError(
                 f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate"
             )
+        # a load, or a pressure that no step applies, can always be held
         load = holdable_loads[name]
-        if not holds_conjugate or load is None:  # a load, or the pressure, can always be held
-            continue
-        if not load.held_conjugate:
-            raise ValueError(
-                f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
-            )
-        # `released` is the reason why a moving step cannot hold it
-        if load.released and (step.load.in_time or step.load.released_by):
-            raise ValueError(f"{key}: conjugate: {load.released}")
+        if holds_conjugate and load is not None:
+            _refuse_unfit_conjugate(key, load, step)
+
+
+def _refuse_unfit_conjugate(key: str, load: Step, step: ProgrammeStep) -> None:
+    """Raise ValueError if a step cannot hold the conjugate of another step's amplitude.
+
+    Parameters
+    ----------
+    key
+        Key of the request, for the message.
+    load
+        The load that drives the amplitude.
+    step
+        The step that would hold the conjugate.
+    """
+    if not load.held_conjugate:
+        raise ValueError(
+            f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
+        )
+    # `released` is the reason why a conjugate cannot be held while the shell moves; it moves in a
+    # motion, and where it is released at the end of a step
+    if load.released and (step.load.in_time or step.load.released_by):
+        raise ValueError(f"{key}: conjugate: {load.released}")
 
 
 def refuse_unknown_patches(
@@ -171,6 +194,7 @@ def refuse_unknown_patches(
         raise ValueError(
             f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file"
         )
+    # the patches within dimples, and all of the surface outside them
     allowed = [*(dimples or ["dimple"]), "rest"]
     if unknown := set(patches) - set(allowed):
         raise ValueError(

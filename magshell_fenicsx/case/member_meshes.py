@@ -4,7 +4,7 @@ A `Mirror` is a symmetry plane; the half on the side of its normal is modelled, 
 other half are removed. A `Sector` lies between two planes through e3. A shell is held if a support
 fixes it. Each shell has its own frame and length; its pose (`ShellPose`) maps them to the common
 frame, in which lengths are over the R of the first shell. A chart is the pair of coordinates on a
-surface.
+surface. `part` and `member` are one of the shells, as `MemberCase`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -63,6 +63,7 @@ class MemberMeshes:
         assembly, members = self._several.assembly, self._several.parts
 
         def member_shells() -> list[MemberShell]:
+            """Return the meshes of the halves, or of the sectors."""
             if isinstance(plane, Sector):
                 return [self._sector(member, plane) for member in members]
             return [self._member(member, self._plane_of_shell(member, plane)) for member in members]
@@ -83,8 +84,11 @@ class MemberMeshes:
 
         Parameters
         ----------
-        vectors, loosely
-            See `Outline.mirrors`.
+        vectors
+            (3,) which the planes should contain, where the shapes leave a choice.
+        loosely
+            Whether planes of a mesh file count too that map areas and centres onto each other, but
+            not the triangles.
         """
         mirrors = list[Mirror]()
         if not self._all_are_held:
@@ -92,12 +96,13 @@ class MemberMeshes:
         members = self._several.parts
         for plane in self._candidates(vectors, loosely):
             for side in (plane, plane.reversed):  # either half may be the one that is modelled
+                # the plane in each shell's frame; None for a shell that is not its own image
                 own_mirrors = [self._mirror_of_shell(member, side, loosely) for member in members]
                 is_known = any(side.is_plane_of(known_plane) for known_plane in mirrors)
                 if is_known or not all(own_mirrors):
                     continue
-                # edges that the half loses, by their names in the common mesh: those of a shell
-                # after its own name
+                # the edges that the half loses. In the common mesh the name of an edge begins with
+                # that of its shell
                 removed_edges = dict[str, str]()
                 for member, mirror in zip(members, own_mirrors, strict=True):
                     own_edges = mirror.removed_edges if mirror else {}
@@ -137,7 +142,13 @@ class MemberMeshes:
             patch = problem.triangulated()
         place = self._several.place(part)
         pose = replace(place, Q=place.Q @ rotation(problem.azimuth).T)
-        return MemberShell(part.name, patch, pose, tuple(part.section.points), problem.outward)
+        return MemberShell(
+            part.name,
+            patch,
+            place=pose,
+            points=tuple(part.section.points),  # their names
+            normal=problem.outward,
+        )
 
     def _sector(self, part: "MemberCase", sector: Sector) -> MemberShell:
         """Return the mesh of the sector of a shell between two planes through e3 of the case.
@@ -148,6 +159,7 @@ class MemberMeshes:
         first_plane, second_plane = (
             self._plane_of_shell(part, side) for side in sector.planes.values()
         )
+        # the mesh of a file may be closed around e3, too
         is_round = reference_shell_of(part.case.shell).perfect.round
         is_closed = is_round or isinstance(part.case.shell, MeshSurface)
         # the shell's own sector, in the same order of planes and in the other one
@@ -184,7 +196,10 @@ class MemberMeshes:
         return replace(own_plane, offset=_rounded(own_plane.offset), removed_edges=removed_edges)
 
     def _mirror_of_shell(self, part: "MemberCase", plane: Mirror, loosely: bool) -> Mirror | None:
-        """Return a plane in a shell's frame if the shell is its own image in it, else None."""
+        """Return a plane in a shell's frame if the shell is its own image in it, else None.
+
+        With `loosely` the plane of a mesh file need not map its triangles onto each other.
+        """
         from magshell_fenicsx.case.modelled_part import (
             own_mirror,
         )  # the solver takes long to import
@@ -199,8 +214,11 @@ class MemberMeshes:
 
         Parameters
         ----------
-        vectors, loosely
-            See `Outline.mirrors`.
+        vectors
+            (3,) which the planes should contain, where the shapes leave a choice.
+        loosely
+            Whether planes of a mesh file count too that map areas and centres onto each other, but
+            not the triangles.
         """
         places = [self._several.place(member) for member in self._several.parts]
         shells_at_places = zip(places, self._reference_shells, strict=True)
@@ -242,7 +260,7 @@ class MemberMeshes:
             h, place = 1 / member.case.shell.R_over_h, several.place(member)
             sample, scale = reference_shell.perfect.sample(), place.scale
 
-            # the defaults keep this shell's values, which change in the loop
+            # the default arguments keep this shell's values when the loop goes on
             def half(
                 x: Array, reference_shell: ReferenceShell = reference_shell, scale: float = scale
             ) -> Array:
@@ -277,7 +295,8 @@ class MemberMeshes:
         pairs = [
             tuple(self._several.shell_of(name) for name in edges) for edges in self._several.joints
         ]
-        # repeated as often as there are joints, so that it reaches the end of a chain of shells
+        # a shell that is joined to a held one is held too. This is repeated as often as there are
+        # joints, so that it reaches the end of a chain of shells
         for _ in pairs:
             for first_name, second_name in pairs:
                 if first_name in is_held and second_name in is_held:

@@ -105,12 +105,13 @@ def modelled_part(
         If the symmetry that the case asks for is not there.
     """
     is_axisymmetric = False
-    if plane is None:
+    if plane is None:  # whether the meridian is modelled, else the plane of a half or a sector
         is_axisymmetric, plane = _symmetry(case, outline, constraints)
     # only a surface of revolution looks the same in a turned frame
     if plane is None or not (outline.round and plane.through_e3):
         return ModelledPart(is_axisymmetric, plane, turn=0.0, mirror=plane)
-    # the frame is turned so that the plane is y = 0, or the first plane of the sector
+    # the frame is turned by the azimuth of the plane, which becomes y = 0. Of a sector this is the
+    # first of its two planes
     waves = plane.waves if isinstance(plane, Sector) else None
     mirror = Y0_PLANE if waves is None else Sector.from_azimuth(0.0, waves)
     return ModelledPart(is_axisymmetric, plane, plane.azimuth, mirror)
@@ -137,15 +138,16 @@ def symmetry_constraints(
 def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
     """Return a plane in which the shell is its own image, with the edges that the half loses.
 
-    The mid-surface, its thickness, plies and imperfections must all be their own images. None if
-    the shell has no such plane equal to `plane`.
+    The mid-surface, its thickness, plies and imperfections must all be their own images. The result
+    is None if `plane` is no such plane of the shell.
 
     Parameters
     ----------
     plane
         The plane to look for, in the frame of the case.
     loosely
-        See `mesh_mirrors`.
+        Whether a plane of a mesh file counts too that maps areas and centres onto each other, but
+        not the triangles.
     """
     reference_shell = reference_shell_of(case.shell)
     perfect = reference_shell.perfect
@@ -158,12 +160,13 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     ]
     if plies := ShellLaminate.from_context(case.context):
         constraints += plies.symmetry_constraints(case.context, perfect)
+    # directions that must lie in the plane, such as that of an imperfection
     vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
     if perfect.round and plane.through_e3:  # then the surface allows every such plane
         candidates: Sequence[Mirror] = [plane]
     else:
         candidates = perfect.mirrors(plane.in_plane_vectors, loosely)
-    for candidate in candidates:  # directions of the constraints must lie in a mirror plane
+    for candidate in candidates:
         has_vectors = all(abs(candidate.normal @ v) < ROUNDING for v in vectors)
         if not candidate.is_plane_of(plane) or not has_vectors:
             continue
@@ -174,7 +177,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
 
 def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
     """Return edge -> condition in the model's terms, in a frame turned about e3 (rad)."""
-    # words of the case file -> of the model, in which "symmetry" is the plane of a half alone
+    # the word of the case file -> that of the model, which calls "symmetry" the plane of a half
     terms: dict[EdgeCondition, Condition] = {
         "hinged": "simply supported",
         "symmetry": "plane",
@@ -195,9 +198,11 @@ def _turned_components(components: tuple[int, ...], turn: float) -> list[int]:
 
     The frame is turned about e3 by `turn` (rad), into which the components turn as a whole.
     """
-    axes = np.eye(3)[list(components)] @ rotation(turn).T
-    # the held directions span a turned axis, or are across it: squares are 1 or 0 but for rounding
-    return [i for i in range(3) if axes[:, i] @ axes[:, i] > 0.5]
+    # the held directions (held, 3), by their components in the turned frame
+    directions = np.eye(3)[list(components)] @ rotation(turn).T
+    # a turned axis is spanned by them, or is normal to them: the sum of the squares of its
+    # components is 1 or 0, up to rounding
+    return [i for i in range(3) if directions[:, i] @ directions[:, i] > 0.5]
 
 
 def _fraction(plane: Mirror | None) -> str:
@@ -215,17 +220,19 @@ def _symmetry(
     The plane is None for a meridian and for a full model. Raises CaseError if the symmetry that the
     case asks for is not there; the message says why.
     """
-    # the meridian, a sector of so many waves, all of the shell, or else a half
+    # the meridian
     reason = why_not_axisymmetric(constraints)  # None if all constraints are axisymmetric
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
     if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
         return True, None
-    if isinstance(case.symmetry, int):  # a number of waves
+    # a sector for a number of waves; or all of the shell
+    if isinstance(case.symmetry, int):
         return False, _sector(case, outline, constraints, case.symmetry)
     if case.symmetry not in ("auto", "half"):
         return False, None
-    # a half that is asked for need not map the triangles of a mesh file onto each other
+    # a half. If the case asks for it, its plane need not map the triangles of a mesh file onto each
+    # other
     plane = common_mirror(constraints, outline, loosely=case.symmetry == "half")
     if case.symmetry == "half" and plane is None:
         if name := energy_without_mirror(constraints, outline):

@@ -64,12 +64,12 @@ def merge_shells(
     """
     if not isinstance(data, dict) or data.get("shells") is None:
         return data, None
-    # keys of the merged shell, which are made here
+    # the case must not have keys of the merged shell, which are made here
     for key in REPLACED_KEYS:
         if data.get(key) is not None:
             raise ValueError(f"shells: each has its own {key}: leave out {key}, or shells")
-    # the shells, each with a case of its own; each validation gets a copy of the context, which
-    # lacks what pydantic adds while it validates the whole case, and which it may change
+    # folder and files of the case; each validation below gets a copy of them, which it may change,
+    # without what pydantic has added to the context of the whole case
     context_keys = (
         {key: context[key] for key in ("folder", "files") if key in context} if context else {}
     )
@@ -78,13 +78,14 @@ def merge_shells(
     ).shells
     for name in sections:
         _refuse_name(name, sections)
+    # the shells, each with a case of its own
     member_shells = [
         MemberCase(name, section, _case(name, section, data, {**context_keys}, case))
         for name, section in sections.items()
     ]
     joined_edges = _joined_edges(_with_mesh_names(data.get("joints"), sections))
     several = SeveralShells(member_shells, joined_edges, _pairs(data.get("contact")))
-    # the data of one shell that stands for all of them
+    # the data of the case, with one shell that stands for all of them
     common_keys = _common_shell(member_shells)
     merged_data = {
         key: _with_mesh_names(value, sections) if key in SECTIONS_WITH_NAMES else value
@@ -165,7 +166,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         "points": shell_data.get("points") or {},
     }
     mesh_data = _mesh_data(data.get("mesh") or {}, shell_data.get("mesh") or {})
-    # loads that mesh sizes follow
+    # loads that mesh sizes follow: forces on points of this shell, and a pressure
     points = own_data["points"] if isinstance(own_data["points"], dict) else {}
     loads = [load for load in _forces_on(name, data) if load["at"]["point"] in points]
     if _presses(data.get("loading"), name):
@@ -193,8 +194,8 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
 def _mesh_data(common: Keys, own: Keys) -> Keys:
     """Return the section `mesh` of one shell's own case.
 
-    `common` is the section of the whole case, `own` that of the shell. The shell's refinement comes
-    on top of the common one; its other keys replace those.
+    `common` is the section of the whole case, `own` that of the shell. The refinements of both are
+    multiplied. Other keys of the shell replace the common ones.
     """
     mesh_data = {key: common[key] for key in ("degree", "size", "refinement") if key in common}
     for key, value in own.items():
@@ -212,14 +213,15 @@ def _forces_on(name: str, data: Keys) -> list[Keys]:
     for load in loading if isinstance(loading, list) else [loading]:
         if not isinstance(load, dict) or load.get("kind") != "indentation":
             continue
+        # the point that the load names, in whatever form the data have
         place = load.get("at")
         point = place.get("point") if isinstance(place, dict) else None
         if not isinstance(point, str) or not point.startswith((f"{name}.", f"{name}_")):
             continue
-        # "upper.tip", or "upper_tip" as in the common mesh
+        # the name without that of the shell: from "upper.tip", or "upper_tip" as in the common mesh
         own_point = point.split(".", 1)[1] if "." in point else point.removeprefix(f"{name}_")
         force: Keys = {"kind": "indentation"}
-        if "depth" not in load:  # some force: mesh sizes follow the place, not the amount
+        if "depth" not in load:  # any force will do: mesh sizes follow its place, not its size
             force |= {"control": "load", "force": 1.0}
         force |= {key: load[key] for key in FORCE_KEYS if key in load}
         forces.append(force | {"at": {"point": own_point}})
@@ -244,7 +246,7 @@ def _presses(loading: Any, name: str) -> bool:
 
 
 def _common_shell(parts: Sequence[MemberCase]) -> Keys:
-    """Return the keys of the shell section that stands for all shells.
+    """Return the keys of the shell section that stands for all shells `parts`.
 
     Lengths and material are those of the first shell, over which results are.
     """
@@ -252,18 +254,18 @@ def _common_shell(parts: Sequence[MemberCase]) -> Keys:
     for member in parts:
         _refuse_unfit_shell(member, first_member)
     # numbers become texts with units if the case has units
-    unit = _unit if shell.with_units else (lambda value, unit: value)
+    in_unit = _unit if shell.with_units else (lambda value, unit: value)
     keys: Keys = {
-        "radius": unit(shell.reference, "m"),
-        "thickness": unit(shell.reference / shell.R_over_h, "m"),
+        "radius": in_unit(shell.reference, "m"),
+        "thickness": in_unit(shell.reference / shell.R_over_h, "m"),
         "poisson_ratio": shell.poisson_ratio,
     }
     if shell.with_units:
         keys["unit"] = "m"
     if shell.modulus is not None:
-        keys["youngs_modulus"] = unit(shell.modulus, "Pa")
+        keys["youngs_modulus"] = in_unit(shell.modulus, "Pa")
     if shell.density is not None:
-        keys["density"] = unit(shell.density, "kg/m**3")
+        keys["density"] = in_unit(shell.density, "kg/m**3")
     keys |= {key: getattr(shell, key) for key in KEYS_OF_FIRST if key in shell.model_fields_set}
     return keys
 
@@ -271,6 +273,7 @@ def _common_shell(parts: Sequence[MemberCase]) -> Keys:
 def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
     """Raise ValueError for a shell that cannot be in one mesh with the first one."""
     first_shell, shell = first.case.shell, part.case.shell
+    # units, thickness factor and modulus have the right form
     if shell.with_units != first_shell.with_units:
         part_with, part_without = (first, part) if first_shell.with_units else (part, first)
         raise ValueError(
@@ -287,7 +290,7 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
         raise ValueError(
             part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs")
         )
-    for key in COMMON_KEYS:  # one value for all, also if it is absent
+    for key in COMMON_KEYS:  # all shells have the same value, or none
         if getattr(shell, key) != getattr(first_shell, key):
             raise ValueError(
                 part.refused(
@@ -295,7 +298,8 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
                     "common; their law, youngs_modulus, poisson_ratio and density are their own"
                 )
             )
-    # all shells have a modulus or none, and the same of a density: results are over the first one's
+    # results are over the modulus and the density of the first shell: of each either all shells
+    # have one or none has, and their ratios are limited
     for key, name in (("modulus", "youngs_modulus"), ("density", "density")):
         value_of_first, value = getattr(first_shell, key), getattr(shell, key)
         if (value_of_first is None) != (value is None):
@@ -350,7 +354,7 @@ def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
         for member in several.parts
         if member.section.remanent
     }
-    # either all of them have one, or none; the first one is the unit of all remanences
+    # either all of them have a flux density, or none; the first one is the unit of all remanences
     if len({flux_density is None for flux_density in flux_densities.values()}) > 1:
         without = next(
             name for name, flux_density in flux_densities.items() if flux_density is None
@@ -392,6 +396,7 @@ def _remanences_of(
         )
     factor = 1.0
     if common_density is not None and remanent.flux_density is not None:
+        # from the shell's own flux density to the common one
         factor = remanent.flux_density / common_density
     patches: dict[str, Any] = {}
     # a remanence without patches is that of the whole shell, here of the name ""
@@ -401,6 +406,7 @@ def _remanences_of(
             if isinstance(remanence, RemanentSection)
             else RemanentSection(**remanence.model_dump())
         )
+        # the patch in the common mesh: the whole shell for "" and for the rest of its patches
         patch = part.name if name in ("", "rest") else f"{part.name}_{name}"
         patches[patch] = section.placed(several.place(part), factor)
     return patches
@@ -424,19 +430,21 @@ def _with_mesh_names(data: Any, shells: Mapping[str, Any]) -> Any:
     Keys and values are renamed, except the values of keys that name files. `shells` has the names
     of all shells as keys.
     """
+    # "upper.rim": the name of a shell, a dot, and a word
     pattern = re.compile(rf"({'|'.join(map(re.escape, shells))})\.(\w+)")
 
-    def name(text: Any) -> Any:
+    def renamed(text: Any) -> Any:
         """Return the name of an edge, point or patch in the common mesh; other values unchanged."""
         is_name = isinstance(text, str) and pattern.fullmatch(text)
         return pattern.sub(r"\1_\2", text) if is_name else text
 
-    def walk(part: Any) -> Any:
+    def renamed_in(part: Any) -> Any:
         """Return a part of the data with all names in it replaced."""
         if isinstance(part, dict):
             return {
-                name(key): value if key in FILE_KEYS else walk(value) for key, value in part.items()
+                renamed(key): value if key in FILE_KEYS else renamed_in(value)
+                for key, value in part.items()
             }
-        return [walk(item) for item in part] if isinstance(part, list) else name(part)
+        return [renamed_in(item) for item in part] if isinstance(part, list) else renamed(part)
 
-    return walk(data)
+    return renamed_in(data)

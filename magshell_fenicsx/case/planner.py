@@ -109,8 +109,8 @@ def make_problem(
     terms
         User-defined energies to add to those of the case.
     plane
-        Mirror plane of the half to be modelled, see `modelled_part.own_mirror`; None to find the
-        smallest part that the symmetry of the case allows.
+        Mirror plane of the half to be modelled, in the frame of the case; None to find the smallest
+        part that the symmetry of the case allows.
     smooth
         Keys of the case whose formulas are known to have no details between samples.
     contact_places
@@ -125,19 +125,22 @@ def make_problem(
     """
     if terms:
         case = case.with_terms([*case.own_terms, *terms])
-    # each needs what is before it: outline, samples at details of formulas, symmetry, part, mesh
+    # the surface with its constant imperfections, and the places of loads on it
     shell = _ImperfectShell.of_case(case)
     load_places = _load_places(case, shell.outline)
     for section in case.context.abilities:
         section.refuse_unfit_values(case.context, shell.sample)
+    # further samples of the surface, where formulas have narrow details
     formulas = _ResolvedFormulas.of_case(case, shell.outline, smooth)
     outline = formulas.sampled(shell.outline)
     refuse_unfit_formulas(
         formulas.formulas, outline.sample() if formulas.formulas else shell.sample
     )
+    # the symmetry of all parts of the case decides which part of the shell is modelled
     energies = surface_terms(case.context, case.own_terms)
     constraints = _constraints(case, shell, outline, energies)
     part = modelled_part(case, outline, constraints, plane)
+    # the mesh of that part, and the loads on it
     points = _VertexPoints.of_case(case, load_places, outline, part)
     mesh = _mesh_plan(case, shell, outline, part, points, formulas, contact_places)
     modelled = _modelled(case, shell, part, mesh, points)
@@ -160,8 +163,8 @@ def _modelled(
 ) -> Modelled:
     """Return the modelled part in the form that abilities and load steps read.
 
-    Its deviations and patch rims are functions of places in the frame of the model, which is turned
-    about e3 from that of the case.
+    Its vertices are those of `points` at which load steps act. Its deviations and patch rims are
+    functions of places in the frame of the model, which is turned about e3 from that of the case.
     """
     imperfections, turn = shell.imperfections, part.turn
     return Modelled(
@@ -218,17 +221,8 @@ def _problem(
     meridian = outline.meridian if part.axisymmetric else None
     if meridian:  # its ends are the only edges and points
         refuse_unfit_ends([name for name in meridian.names if name], mesh.points, conditions, loads)
-    # what the model contains and leaves out, in words
-    included, left_out = describe_model(
-        context, loads, part.name(case.model), part.plane, mesh.rim_count
-    )
-    included += [
-        f"{key}: {imperfection.account}"
-        for key, imperfection in shell.imperfections.items()
-        if imperfection.account
-    ]
-    included += [f"own energy: {term.name}" for term in case.own_terms]
-    # of a mesh file there are no samples before it is read
+    included, left_out = _contents_in_words(case, shell, part, loads, mesh.rim_count)
+    # places all over the shell; for a mesh file, which is read here, they are those of the outline
     places = shell.sample if len(shell.sample) else outline.sample()
     unknowns = 0.0  # an estimate, for the memory; a meridian needs little
     if not meridian:
@@ -272,6 +266,31 @@ def _problem(
     )
 
 
+def _contents_in_words(
+    case: Case, shell: "_ImperfectShell", part: ModelledPart, loads: Loads, rim_count: int
+) -> tuple[list[str], list[str]]:
+    """Return what the model contains and what it leaves out: two lists of lines for people.
+
+    Parameters
+    ----------
+    part, loads
+        Which part of the shell is modelled, and all loads of the model.
+    rim_count
+        Number of different rims of imperfections.
+    """
+    included, left_out = describe_model(
+        case.context, loads, part.name(case.model), part.plane, rim_count
+    )
+    # words on the origin of an imperfection, such as the draw of a random one
+    included += [
+        f"{key}: {imperfection.account}"
+        for key, imperfection in shell.imperfections.items()
+        if imperfection.account
+    ]
+    included += [f"own energy: {term.name}" for term in case.own_terms]
+    return included, left_out
+
+
 def document_of(case: Case) -> Document:
     """Return what a run writes down about its case: data, file name and the files that it names."""
     return Document(
@@ -307,6 +326,7 @@ def _pending_modes(case: Case) -> PendingModes | None:
     count = max((len(section.amplitudes) for _, _, section in pending_sections), default=0)
     if not count:
         return None
+    # their number, the problem that has the modes, and the problem that takes them
     return PendingModes(
         count,
         lambda: make_problem(perfect_case(case)),
@@ -387,9 +407,10 @@ class _ImperfectShell:
     @classmethod
     def of_case(cls, case: Case) -> "_ImperfectShell":
         """Return the shell of a case, with imperfections sorted into growing and constant ones."""
-        # the reference shell, on which imperfections are placed, has none yet
+        # imperfections are placed on the perfect shell
         material, reference = _material(case), reference_shell_of(case.shell)
         imperfections = imperfection_geometries(case.imperfections, reference)
+        # the keys of imperfections whose deviation a step multiplies
         last_steps = {step.name: step for step in case.programme}
         growing_keys = {
             key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
@@ -441,13 +462,14 @@ def _imperfect_outline(
 ) -> Outline:
     """Return an outline with the constant imperfections, in a frame turned about e3 (rad).
 
-    Element sizes follow all `imperfections`, because growing ones need small elements too. The
-    deviation consists of those with keys in `constant` alone.
+    The deviation is the sum of those imperfections whose keys are in `constant`. The element size
+    of the outline follows all `imperfections`, because growing ones need small elements too.
     """
     if not imperfections:
         return perfect
     geometries = imperfections.values()
-    circles: tuple[float, ...] = ()  # radii around the pole at which the curvature jumps
+    # radii around the pole of a disc at which the curvature jumps: the rims of imperfections
+    circles: tuple[float, ...] = ()
     if perfect.disc:
         circles = tuple(geometry.reach for geometry in geometries if geometry.rim)
     deviations = tuple(
@@ -455,7 +477,8 @@ def _imperfect_outline(
         for key, geometry in imperfections.items()
         if key in constant
     )
-    return perfect.deviated(deviations, circles, min(geometry.size for geometry in geometries))
+    largest = min(geometry.size for geometry in geometries)
+    return perfect.deviated(deviations, circles, largest)
 
 
 def _load_places(case: Case, outline: Outline) -> StepsAtPlaces:
@@ -480,8 +503,8 @@ class _ResolvedFormulas:
     formulas
         The keys of the case that have formulas of the undeformed place.
     cells
-        For each element of `formulas` the division of the surface, see `adaptive_cells`; None for a
-        smooth formula.
+        For each element of `formulas` a division of the surface into cells, smaller where the
+        formula varies more; None for a smooth formula.
     """
 
     formulas: Sequence[PlacedFormulas]
@@ -511,7 +534,8 @@ def _constraints(
 
     The parts are shape, abilities, load steps, named points, `energies`, imperfections and bodies.
     """
-    one_by_one = bool(case.patches)  # named patches: each imperfection must be its own image
+    # if patches have names, each imperfection must be its own mirror image, not that of another
+    one_by_one = bool(case.patches)
     constraints = symmetry_constraints(case, outline, energies)
     constraints += imperfection_constraints(
         shell.imperfections, shell.perfect, one_by_one=one_by_one
@@ -567,8 +591,8 @@ class _VertexPoints:
         for name, (step, place) in load_places.items():
             chart = step.load.chart_of(place, outline, part.turn, half=part.is_symmetric)
             chart = on_features(chart, outline, charts)
-            # a load at the pole or at the place of an earlier load shares that point; a new point
-            # has the name of its step, with "load" for "force"
+            # a load at the pole, or at the place of an earlier load, shares the point there. Else
+            # it gets a point with the name of its step, in which "load" replaces "force"
             candidates = (point for point in ("pole", *of_steps.values()) if point in charts)
             at_same_place = (point for point in candidates if np.array_equal(charts[point], chart))
             of_steps[name] = next(at_same_place, name.replace("force", "load"))
@@ -581,6 +605,7 @@ class _VertexPoints:
 
     def concentrated_loads(self, case: Case) -> list[Loaded]:
         """Return (chart, loads there) for each point with a concentrated load."""
+        # loads that name a point of the case, then loads at a place of their own
         loads: list[Loaded] = [
             (self.charts[point], [step.load])
             for step in case.programme
@@ -659,20 +684,13 @@ def _mesh_plan(
         local = local_imperfections(shell.imperfections.items(), shell.perfect, part.turn)
     # contacts are in the model's frame, zones of contact are found with the sampled outline
     bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
-    sampled_shell = replace(shell.reference, imperfect=outline)
-    contact_regions = [
-        ContactZone.of_body(
-            contact,
-            (step.load for step in case.programme if step.name == contact.amplitude),
-            sampled_shell,
-        )
-        for contact in bodies
-    ]
+    contact_regions = _contact_regions(case, bodies, replace(shell.reference, imperfect=outline))
+    # the charts of places where other shells touch this one, in the model's frame
     charted_places = [
         ContactPlace(chart_of(rotation(part.turn) @ x, outline, half=part.is_symmetric))
         for x in contact_places
     ]
-    # squares where formulas need small elements, and a limit everywhere
+    # squares in which formulas or spread imperfections need small elements, and the largest size
     varying, largest = _size_limits(case, shell, outline, part, formulas)
     refined: list[Refined] = [*local, *contact_regions, *charted_places]
     size = grading(
@@ -695,6 +713,23 @@ def _mesh_plan(
         vertices = Vertices.of_case(case, points.charts, turned_outline, size, part.turn)
         vertices.refuse_near(shape, part.mirror)
     return _MeshPlan(turned_outline, shape, size, points.charts, bodies, contact_regions, len(rims))
+
+
+def _contact_regions(
+    case: Case, bodies: Sequence[ContactBody], shell: ReferenceShell
+) -> list[ContactZone]:
+    """Return for each rigid body the zone of a shell in which it presses.
+
+    The zone follows from the load steps that move the body, those with the name of its amplitude.
+    """
+    return [
+        ContactZone.of_body(
+            contact,
+            (step.load for step in case.programme if step.name == contact.amplitude),
+            shell,
+        )
+        for contact in bodies
+    ]
 
 
 def _size_limits(
@@ -738,11 +773,12 @@ def _shape(
     """
     shape = outline.chart(part.mirror, size)
     is_grid = isinstance(shape, Grid)
-    if part.sector and not is_grid:  # of a sector a grid is a part of a ring, which has no tip
+    # a sector has a tip at the axis, except in a grid, which is a part of a ring
+    if part.sector and not is_grid:
         size = towards_tip(size, part.sector)
         shape = outline.chart(part.sector, size)
     if isinstance(shape, Grid) and part.mirror and not part.sector:
-        # what a point needs, its image needs too
+        # the grid has lines at a point, and at its mirror image on the other half
         images = []
         for chart in points:
             place = outline.embedding(chart[None])[0]
@@ -773,7 +809,8 @@ def towards_tip(size: Grading, sector: Sector) -> Grading:
 
     Without that, triangles beside the axis of a disc would be thin.
     """
-    # from a least size at the tip, sizes grow by the sector's angle (rad) per distance: its width
+    # from a least size at the tip, sizes grow per distance by the sector's angle (rad), as its
+    # width does
     least_size = MIN_SIZE_AT_TIP * size.largest
     tip = DiscFeature(centre=(0.0, 0.0), radius=0.0, size=least_size, growth=sector.angle)
     return replace(size, features=[*size.features, tip])
@@ -804,7 +841,7 @@ def _with_rims(
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
-        # of circles nearer to each other than an element some are left out
+        # where circles are nearer to each other than an element, some are left out
         lines = line_coordinates(
             np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius)
         )
@@ -815,7 +852,12 @@ def _with_rims(
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:
     """Estimate the number of triangles of the modelled part.
 
-    `plane` is the symmetry plane of the part, in the frame of the case; None for a whole shell.
+    Parameters
+    ----------
+    shape, size
+        The shape that is triangulated, and the element sizes on it.
+    plane
+        The symmetry plane of the part, in the frame of the case; None for a whole shell.
     """
     if isinstance(shape, MeshFile):
         # a mesh of several shells has the cells of the half alone, others those of the whole shell
@@ -833,17 +875,17 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     joined; of other values the first one that is set counts.
     """
     context, last_steps = case.context, {step.name: step for step in case.programme}
-    # a step may also drive or hold amplitudes of which no step has the name
+    # names of all amplitudes: those of steps, and others that a step drives or holds
     amplitudes = set(last_steps)
     for step in case.programme:
         amplitudes.update(step.load.drives, step.load.hold)
-    # `implied` is what the amplitude of a kind of step needs, `adds` what this step contributes
+    # what amplitudes need, by the kind of step that drives them; then what steps and abilities add.
+    # Each addition maps names of attributes of `Loads` to values
     additions = [
         kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in amplitudes
     ]
     additions += [step.load.adds(step, context, modelled) for step in last_steps.values()]
     additions += [section.adds(context, modelled) for section in context.abilities]
-    # each addition maps names of attributes of `Loads` to values
     sums: dict[str, Any] = {}
     for addition in additions:
         for name, value in addition.items():
@@ -868,6 +910,7 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
         return Thickness(user_field=factor)
     if not factor:
         return None
+    # the formula as a function of a place in the frame of the case
     in_case_frame, Q = formula(factor), rotation(turn)
 
     def in_model_frame(x: Array, y: Array, z: Array) -> Array:

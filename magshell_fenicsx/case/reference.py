@@ -1,9 +1,10 @@
 """The JSON Schema of the case file, for editors, and its reference in Markdown.
 
 The results are docs/case.schema.json and docs/case.md. A section of the case is a definition of the
-schema; a part is any piece of the schema: a dictionary, a list or a value. A tag is the key, such
-as `kind`, whose value tells sections of one family apart: the sections that may stand under one
-key.
+schema; a part is any piece of the schema: a dictionary, a list or a value. A family is the sections
+that may stand under one key of the case; the value of its tag, a key such as `kind`, tells which
+one stands there. Many functions take `titles`, a mapping from the name of each section to its title
+in the Markdown text, for links.
 """
 
 import json
@@ -77,6 +78,7 @@ class _WithMeanings(GenerateJsonSchema):
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
         """Return the schema of a section, titled by its class, with a description of each key."""
         schema_of_model = super().model_schema(schema)
+        # module and class, so that titles are unique
         schema_of_model["title"] = f"{schema['cls'].__module__}.{schema['cls'].__qualname__}"
         for key, value in schema_of_model.get("properties", {}).items():
             if words := meaning(schema["cls"], key):
@@ -118,6 +120,7 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
     pydantic 2.14 writes some sections in full where they are used. References go by titles first,
     which are unique (module and class); then titles are shortened to names of classes.
     """
+    # reference to a definition -> title of the section
     titles = {
         f"#/$defs/{name}": section["title"]
         for name, section in schema_of_case["$defs"].items()
@@ -159,31 +162,43 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
         for name, section in definitions_of_case.items()
         if f"#/$defs/{name}" not in titles
     }
-    # two classes of one name keep the whole title
-    class_counts = Counter(title.rsplit(".", 1)[-1] for title in sections)
-    definition_names = {}
-    for title in sections:
-        class_name = title.rsplit(".", 1)[-1]
-        is_unique = class_counts[class_name] == 1
-        definition_names[title] = class_name if is_unique else title.replace(".", "__")
-
-    def shortened(part: Any) -> Any:
-        """Return a part of the schema with references to definition names in place of titles."""
-        if isinstance(part, list):
-            return [shortened(item) for item in part]
-        if not isinstance(part, dict):
-            return part
-        return {
-            key: f"#/$defs/{definition_names[value]}"
-            if key == "$ref" and value in definition_names
-            else shortened(value)
-            for key, value in part.items()
-        }
-
+    definition_names = _definition_names(sections)
     definitions = {
         definition_names[title]: section for title, section in sections.items()
     } | other_definitions
-    return dict(shortened({**with_names, "$defs": dict(sorted(definitions.items()))}))
+    with_definitions = {**with_names, "$defs": dict(sorted(definitions.items()))}
+    return dict(_with_short_references(with_definitions, definition_names))
+
+
+def _definition_names(titles: Collection[str]) -> dict[str, str]:
+    """Return title of a section, its module and class -> name of its definition.
+
+    That is the name of the class; two classes of one name keep the whole title.
+    """
+    class_counts = Counter(title.rsplit(".", 1)[-1] for title in titles)
+    definition_names = {}
+    for title in titles:
+        class_name = title.rsplit(".", 1)[-1]
+        is_unique = class_counts[class_name] == 1
+        definition_names[title] = class_name if is_unique else title.replace(".", "__")
+    return definition_names
+
+
+def _with_short_references(part: Any, definition_names: dict[str, str]) -> Any:
+    """Return a part of the schema with references to definitions in place of titles.
+
+    `definition_names` maps the title of a section to the name of its definition.
+    """
+    if isinstance(part, list):
+        return [_with_short_references(item, definition_names) for item in part]
+    if not isinstance(part, dict):
+        return part
+    return {
+        key: f"#/$defs/{definition_names[value]}"
+        if key == "$ref" and value in definition_names
+        else _with_short_references(value, definition_names)
+        for key, value in part.items()
+    }
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
@@ -246,8 +261,10 @@ def reference() -> str:
     before the sections.
     """
     case_schema = schema()
+    # name of a section -> its schema, the key paths at which it stands, and its title
     sections, places = case_schema["$defs"], _places(case_schema, case_schema["$defs"])
     titles = {name: _title(paths, sections[name]) for name, paths in places.items()}
+    # key path of a family -> its sections
     families = defaultdict[str, list[Schema]](list)
     for name, title in titles.items():
         if _tag_key(sections[name]):
@@ -258,6 +275,7 @@ def reference() -> str:
     for name, title in titles.items():
         family = _family(title)
         if family in families and family not in common_of_family:
+            # the list of common keys, empty if there are none, and what it says of each
             text, common_of_family[family] = _common_keys(family, families[family], titles)
             texts += [text] if text else []
         common = common_of_family[family] if _tag_key(sections[name]) else set()
@@ -268,7 +286,7 @@ def reference() -> str:
 def _family(title: str) -> str:
     """Return the key path that all sections of a family share, from the title of one of them.
 
-    A family is a set of sections under one key that a tag such as `kind` tells apart.
+    For example "loading" from "loading, kind: field".
     """
     return title.split(", ")[0]
 
@@ -314,6 +332,7 @@ def _common_keys(
             counts[replace(text, default="")] += 1
     items, common = list[str](), set[KeyText]()
     all_kinds = [kind for section in sections for kind in _tags(section)]
+    # an item for each key that more than one section has
     for without_default in (text for text, count in counts.items() if count > 1):
         texts = [text for text in kinds_of_text if replace(text, default="") == without_default]
         # the default of most kinds comes first, alone; others have their kinds in brackets
@@ -335,7 +354,10 @@ def _common_keys(
 
 
 def _kinds_in_words(kinds: Sequence[str], all_kinds: Sequence[str]) -> str:
-    """Return words for the kinds of section that have a key; empty if all have it."""
+    """Return words for the kinds of section that have a key; empty if all have it.
+
+    They are "of a, b", or "all but c" where this is shorter. `all_kinds` are those of the family.
+    """
     kinds_without = [kind for kind in all_kinds if kind not in kinds]
     if not kinds_without:
         return ""
@@ -345,9 +367,16 @@ def _kinds_in_words(kinds: Sequence[str], all_kinds: Sequence[str]) -> str:
 
 
 def _places(of_case: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
-    """Return section -> the key paths under which a case has it, in the order of the file.
+    """Return name of a section -> the key paths under which a case has it.
 
-    A key of any name is NAME in a path.
+    They are in the order of the file. A key of any name is NAME in a path.
+
+    Parameters
+    ----------
+    of_case
+        Schema of the whole case.
+    sections
+        Name of each section -> its schema.
     """
     places: dict[str, list[str]] = {}
 
@@ -424,7 +453,7 @@ def _key_texts(section: Schema, titles: dict[str, str]) -> list[KeyText]:
 
     The tag is left out where the title already says all of it.
     """
-    # of the whole case the required keys are in the first of two alternatives
+    # the whole case has two alternatives, one shell or several; the first has the required keys
     required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
     return [
         _key_text(key, value, key in required, titles)
@@ -445,6 +474,7 @@ def _key_text(key: str, part: Schema, required: bool, titles: dict[str, str]) ->
     titles
         Name of each section -> its title, for links.
     """
+    # group 1 is the meaning, group 2 the unit or None
     meaning_and_unit = re.fullmatch(
         r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split())
     )
@@ -469,12 +499,13 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
 
     `titles` maps the name of each section to its title, for links.
     """
-    # a section, alternatives, fixed values, or else a value by its type
+    # a section
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
         # a title with a tag is "loading, kind: field": the link says the tag's value alone
         words = title.split(": ")[-1] if ": " in title else title.split(", ")[0]
         return f"[{words}](#{anchor(title)})"
+    # alternatives, of which null is not shown
     for alternatives in ("anyOf", "oneOf"):
         if alternatives in part:
             choices = [
@@ -484,10 +515,12 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
             ]
             # pydantic writes oneOf for sections that a tag tells apart
             return (", " if alternatives == "oneOf" else " or ").join(choices)
+    # fixed values
     if "const" in part or "enum" in part:
         return ", ".join(
             f"`{_value_text(value)}`" for value in part.get("enum", [part.get("const")])
         )
+    # any value of a type
     kind = part["type"]
     if kind == "string":
         return f"text such as `{part['examples'][0]}`" if "examples" in part else "text"
@@ -503,7 +536,7 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
 def _allowed_list(part: Schema, titles: dict[str, str]) -> str:
     """Return words for a list, such as "[text, number]" or "list of 3 × number".
 
-    `titles` is as of `_allowed`.
+    `titles` maps the name of each section to its title, for links.
     """
     if "prefixItems" in part:
         items = (_allowed(item, titles) for item in part["prefixItems"])

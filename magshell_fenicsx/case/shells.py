@@ -130,8 +130,8 @@ def in_words_of_shells(message: str, data: Any) -> str:
         return message
     texts = {*_texts(data)}  # all keys and values of the case file
     for name in map(str, shells):
-        # names of the shell's edges and points: those after "name." anywhere in the case, those in
-        # the shell's own section, and the edges of all geometries; as alternatives of a pattern
+        # possible names of the shell's edges and points: those after "name." anywhere in the case,
+        # those in the shell's own section, and the edges of all geometries
         names_in_text = {
             text.removeprefix(f"{name}.")
             for text in texts
@@ -140,8 +140,8 @@ def in_words_of_shells(message: str, data: Any) -> str:
         own_names = filter(str.isidentifier, _texts(shells[name]))
         known_names = "|".join(sorted({*EDGE_NAMES, *names_in_text, *own_names}))
         shell = re.escape(name)
-        # first keys: boundary.a_rim is shells.a.boundary.rim in the file; then single names, if
-        # they are no part of a path, a file name or a column such as a_tip_uz
+        # first keys: boundary.a_rim becomes shells.a.boundary.rim. Then single names: a_rim becomes
+        # a.rim, unless it is part of a path, of a file name or of a column such as a_tip_uz
         message = re.sub(
             rf"\b(boundary|points)\.({shell})_({known_names})\b", r"shells.\2.\1.\3", message
         )
@@ -259,8 +259,8 @@ class SeveralShells:
             for member in self.parts
         }
         members = MemberMeshes(self)
-        # in the order of the fields of `MultiShellMesh`: planes of symmetry, meridians, normal at a
-        # place, and the mesh of all halves
+        # functions that return planes of symmetry, meridians, the normal at a place, and the mesh
+        # of all halves; in the order of the fields of `MultiShellMesh`
         functions_of_members = (
             members.mirrors,
             partial(meridians, self),
@@ -273,6 +273,7 @@ class SeveralShells:
 
     def shell_of(self, name: str) -> str:
         """Return the name of the shell that has an edge; a shell's name is returned as it is."""
+        # the name of an edge begins with that of its shell and an underscore
         return next(
             (part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name
         )
@@ -289,9 +290,10 @@ class SeveralShells:
         for member in self.parts:
             with member.naming():
                 own_thickness = member.case.problem().thickness
-            ratio = self.ratio(member)  # of the nominal thicknesses
+            ratio = self.ratio(member)  # of its nominal thickness to that of the first shell
             factors[member.name] = ratio
-            # a shell's own factor: a formula in its own frame, or numbers by its own patches
+            # a shell's own factor, which multiplies the ratio: a formula in its own frame, or
+            # numbers by its own patches
             if own_thickness and own_thickness.of_position:
                 factors[member.name] = PlacedFactor(own_thickness, self.place(member), ratio)
             own_patches = (own_thickness and own_thickness.patches) or {}
@@ -355,8 +357,9 @@ class SeveralShells:
         has_density = self.parts[0].case.shell.density is not None
         scales = "R, h, E, nu and the density" if has_density else "R, h, E and nu"
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
-        law_words = self.assembly.laws  # name of a shell -> name of its law
+        law_words = self.assembly.laws  # name of a shell -> its law in words
         for member in self.parts[1:]:
+            # thickness, material where shells differ in it, and law where they differ in that
             line = f"h {self.ratio(member):.4g} times" + (
                 "" if member.case.thickness_factor is None else " its factor"
             )
@@ -390,6 +393,7 @@ def _rotation_about(i: int, j: int) -> Callable[[float], Array]:
     """Return the rotation (3, 3) from axis i towards axis j, as a function of its angle (rad)."""
 
     def rotation(angle: float) -> Array:
+        """Return the rotation by an angle."""
         Q, c, s = np.eye(3), np.cos(angle), np.sin(angle)
         Q[i, i], Q[i, j], Q[j, i], Q[j, j] = c, -s, s, c
         return Q

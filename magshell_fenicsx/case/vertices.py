@@ -58,7 +58,7 @@ def named_points(case: "Case", outline: Outline, turn: float, plane: Mirror | No
     Q, R = rotation(turn), case.shell.reference
     points: Points = {}
     for name, place in case.points.items():
-        x = np.array(place) / R  # in the case's frame, Q x is in the model's
+        x = np.array(place) / R  # in the frame of the case; Q x is the place in that of the model
         refuse_off_surface(f"points.{name}", x, outline, R, with_units=case.shell.with_units)
         chart = chart_of(_on_planes(Q @ x, plane), outline, half=plane is not None)
         points[name] = on_features(chart, outline, points)
@@ -111,7 +111,8 @@ def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> 
             return point
     if outline.disc and is_at(np.zeros(CHART)):  # the pole is the origin of a disc's chart
         return np.zeros(CHART)
-    # one edge after the other: at a corner the chart is moved onto both edges that meet there
+    # one edge after the other: at a corner the chart is moved onto both edges that meet there. So
+    # the nearest place on an edge is that of the chart moved so far
     for edge in edges_near(chart, outline):
         on_edge = edges_near(chart, outline)[edge]
         chart = on_edge if is_at(on_edge) else chart
@@ -123,7 +124,7 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
 
     Glued sides of a grid are no edges.
     """
-    # edges do not depend on the part that is modelled, nor on element sizes: any will do
+    # the edges are those of the whole shell, whatever the element sizes
     any_size = Grading([], 1.0)
     shape = outline.chart(None, any_size)
     if isinstance(shape, DiscShape):
@@ -136,11 +137,12 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
         assert isinstance(shape, Grid)
         lowest, highest = np.array(shape.low), np.array(shape.high)
         names, glued = shape.sides, shape.glued
-    # of both axes x and y: whether the upper edge is nearer than the lower one
+    # a rectangle. For both axes x and y: whether the upper edge is nearer than the lower one, and
+    # the coordinate of the nearer one
     is_high = chart - lowest >= highest - chart
     nearest = np.where(is_high, highest, lowest)
-    # names are those of low and high x, then of low and high y; on an edge one coordinate is its
-    # own and the other that of the chart
+    # `names` are those of the edges at low and high x, then at low and high y. The nearest place on
+    # an edge has the edge's coordinate along one axis, and that of the chart along the other
     return {
         names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
         for axis in range(CHART)
@@ -192,8 +194,8 @@ class Vertices:
     def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
         """Check that points are far enough from each other, from edges and from planes of symmetry.
 
-        `plane` is the mirror plane or sector of the modelled part. The nodes of a mesh file are not
-        checked.
+        `shape` is what is meshed, `plane` the mirror plane or sector of the modelled part. The
+        nodes of a mesh file are not checked.
 
         Raises
         ------
@@ -205,10 +207,11 @@ class Vertices:
         for name in self.points:
             self._refuse_beside_edges(name, shape, plane)
         charts = list(self.points.values())
+        # (points, 2): of a grid the numbers of the lines that cross at each point's vertex
         vertices = shape.vertices_of(charts) if isinstance(shape, Grid) else None
         # every two points; points at one place share a vertex and are allowed
         for (i, name), (j, other_name) in combinations(enumerate(self.points), 2):
-            if vertices is not None:  # in a grid: both take the same vertex
+            if vertices is not None:  # in a grid points are too near if they take the same vertex
                 is_near = (vertices[i] == vertices[j]).all()
             else:
                 distance = float(np.hypot(*(charts[i] - charts[j])))
@@ -233,7 +236,7 @@ class Vertices:
         (place,) = self.outline.embedding(chart[None])
         for side in plane.planes.values() if plane else ():
             distance = float(side.signed_distance(place))
-            if ROUNDING < abs(distance) < factor * size:  # a point on the plane is at its vertex
+            if ROUNDING < abs(distance) < factor * size:  # beside the plane, not on it
                 on_plane = self._in_case_frame(place - distance * side.normal)
                 hint = "put it there, or take symmetry: none"
                 self._refuse(name, on_plane, "the plane of symmetry at [{}]", hint, factor)
@@ -243,7 +246,10 @@ class Vertices:
                 self._refuse(name, place_on_edge, words, "put it there", factor)
 
     def _size_of_elements(self, chart: Array, shape: Grid | PlaneShape) -> float:
-        """Return the size of the elements at a chart (2,); no element is wider than the shape."""
+        """Return the size of the elements at a chart (2,).
+
+        The element sizes limit it, and so do the lines of a grid, or the width of another shape.
+        """
         if isinstance(shape, Grid):  # its lines may be denser than the element sizes ask for
             return min(
                 self.size(chart),

@@ -116,8 +116,8 @@ def advance(
     while end - motion.t > END_TOLERANCE * (end - begin):
         before_step()
         remaining = end - motion.t
-        # dt is the length to which the step adapts; after the time `fastest` only the error limits
-        # it
+        # dt is the length to which the step has adapted so far. `longest` limits it up to the time
+        # `fastest` alone
         longest = steps.longest if motion.t < steps.fastest else dt
         dt = min(dt, steps.fixed or dt, longest)
         # steps of equal length up to the end, none of them tiny; rounding must not add one
@@ -130,28 +130,55 @@ def advance(
                 raise TimeStopped(f"the time step has become too small: {trial}", motion)
             continue
         if steps.fixed is None:
-            # the error of a step grows with the third power of its length; 0.9 is for safety
-            length_ratio = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
-            if trial.error > steps.tolerance and length > smallest:
-                dt = max(0.3, length_ratio) * length
+            dt, is_accepted = _adapted_length(steps, motion, trial, length, dt, smallest)
+            if not is_accepted:
                 continue
-            # over the allowed leak; nan, which is not larger, where the balance is not checked
-            leak = abs(trial.imbalance - motion.imbalance) / steps.allowed_leak(trial)
-            if leak > 1 and abs(trial.imbalance) > abs(motion.imbalance):
-                if length <= smallest:
-                    raise TimeStopped(leak_message(motion, trial), motion)
-                # as if the leak grew with the square of the length
-                dt = max(0.3, 0.8 / leak**0.5) * length
-                continue
-            length_ratio = min(length_ratio, 1.0) if leak > MAX_LEAK_FOR_GROWTH else length_ratio
-            # a change of the length takes new factors, so that it must be worth it
-            unchanged = max(length, dt if length_ratio > 1 else 0.0)
-            dt = length * min(length_ratio, 2.0) if length_ratio > 1.3 else unchanged
-        elif not failed:  # after a failure only the second success in turn
+        elif not failed:  # after a failure the length grows at the second success in turn
             dt = max(dt, 2 * length)
         failed = False
         motion = trial
     return replace(motion, t=end), dt
+
+
+def _adapted_length(
+    steps: TimeSteps, motion: Motion, trial: Motion, length: float, dt: float, smallest: float
+) -> tuple[float, bool]:
+    """Return the length of the next step, and whether the trial of this step is accepted.
+
+    It is not accepted if its error is too large or it leaks: then it is repeated.
+
+    Parameters
+    ----------
+    motion, trial
+        The motion before and after the step.
+    length, dt
+        The length of the step, and the length to which steps had adapted before.
+    smallest
+        The smallest length.
+
+    Raises
+    ------
+    TimeStopped
+        If a step of the smallest length leaks.
+    """
+    # the error of a step grows with the third power of its length; 0.9 is for safety
+    length_ratio = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
+    if trial.error > steps.tolerance and length > smallest:
+        return max(0.3, length_ratio) * length, False
+    # the leak over the allowed one. It is nan where the balance is not checked, and no comparison
+    # with nan is true
+    leak = abs(trial.imbalance - motion.imbalance) / steps.allowed_leak(trial)
+    if leak > 1 and abs(trial.imbalance) > abs(motion.imbalance):
+        if length <= smallest:
+            raise TimeStopped(leak_message(motion, trial), motion)
+        # as if the leak grew with the square of the length
+        return max(0.3, 0.8 / leak**0.5) * length, False
+    length_ratio = min(length_ratio, 1.0) if leak > MAX_LEAK_FOR_GROWTH else length_ratio
+    # another length needs a new factorisation: the length grows, to twice at most, only if it can
+    # grow by more than 30 %
+    if length_ratio > 1.3:
+        return length * min(length_ratio, 2.0), True
+    return max(length, dt if length_ratio > 1 else 0.0), True
 
 
 def leak_message(begin: Motion, end: Motion) -> str:

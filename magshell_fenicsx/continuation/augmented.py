@@ -183,10 +183,12 @@ class DifferenceSystem:
 
 
 class AugmentedRows:
-    """The rows of Newton's step at a state of a boundary, in the unknowns dmu, dp and alpha.
+    """The linear equations (rows) of Newton's step at a state of a boundary.
 
     The step is du = alpha v - w_R - dmu w_mu - dp w_p: with it R + K du + R_mu dmu + R_p dp is a
-    multiple of b. The constructor is collective.
+    multiple of b. Three rows determine the scalar unknowns dmu, dp and alpha. A row is given by its
+    coefficients of these three and its constant term, four numbers whose weighted sum is zero. The
+    constructor is collective.
 
     Parameters
     ----------
@@ -215,7 +217,8 @@ class AugmentedRows:
         The vectors Pi'''(v, v, .) and (dK/dmu) v, (dK/dp) v at fixed u.
 
     Private fields: `_R` is the residual. `_mixed_size` is the size of the terms that may cancel in
-    the row v . R_mu, for its rounding.
+    the row v . R_mu, for its rounding. `_difference` are the systems of the difference by p,
+    `_tangent` is the augmented tangent.
     """
 
     def __init__(
@@ -238,12 +241,14 @@ class AugmentedRows:
         self.w_R, self.t_R = tangent.solve(self._R)
         self.w_mu, self.t_mu = tangent.solve(system.load(u, mu, name))
         step_factor = difference_step(system, v)
+        # residuals at u + step_factor v and at u - step_factor v
         forward, backward = (system.residual(u + sign * step_factor * v, mu) for sign in (1, -1))
         # Pi'''(v, v, .) by a second difference of the residual
         self.cubic = np.asarray((backward - 2 * self._R + forward) / step_factor**2)
         self.v, self.unstable = v, tangent.unstable
         # v . R_mu = t_mu, since v . K w_mu = -g b . w_mu = 0
         self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
+        # (dK/dmu) v is the derivative of the load vector R_mu along v
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
         R_p, self.K_p_v = self._derivatives_by_p(step_factor, forward, backward)
         self.w_p, self.t_p = tangent.solve(R_p)
@@ -305,7 +310,7 @@ class AugmentedRows:
         g, pull = (0.0, 0.0) if is_tangent or settled else (tangent.g, self.t_mu)
 
         def coefficients(c: Vector) -> list[float]:
-            """Return the row of c . du: the coefficients of dmu, dp, alpha, and the constant."""
+            """Return c . du: its coefficients of dmu, dp and alpha, and its constant term."""
             return [
                 -dot(comm, c, self.w_mu),
                 -dot(comm, c, self.w_p),
@@ -313,16 +318,19 @@ class AugmentedRows:
                 -dot(comm, c, w_R),
             ]
 
-        # -(g + dg) = 0 with -dg = Pi'''(v, v, du) + v . K_mu v dmu + v . K_p v dp
+        # first row: K is singular, -(g + dg) = 0 with
+        # -dg = Pi'''(v, v, du) + v . K_mu v dmu + v . K_p v dp
         cubic, K_mu_vv = coefficients(self.cubic), dot(comm, v, self.K_mu_v)
         K_p_vv = dot(comm, v, self.K_p_v)
         singular_row = [cubic[0] + K_mu_vv, cubic[1] + K_p_vv, cubic[2], cubic[3] - g]
-        if kind == "fold":  # the factor of b that is left of the equilibrium
+        # second row: at a fold the force along b that is left of the equilibrium is zero, at a
+        # bifurcation the load does no work along v
+        if kind == "fold":
             kind_row = [self.t_mu, self.t_p, -tangent.g, t_R]
         else:
             kind_row = self._row_without_work(coefficients, pull)
+        # third row: the given one; along the tangent of the curve its value changes by 1
         c = coefficients(row.du) if row.du is not None else [0.0] * 4
-        # for the tangent the row changes by 1 along it
         constant = c[3] + value if value is not None else -1.0
         place_row = [c[0] + row.dmu, c[1] + row.dp, c[2], constant]
         dmu, dp, alpha = self._solve_rows(np.array([singular_row, kind_row, place_row]))
@@ -344,10 +352,13 @@ class AugmentedRows:
         rows[:, :3] *= units
         # every row is scaled to order one
         row_sizes = np.abs(rows[:, :3]).max(axis=1)
-        if self._kind == "bifurcation":  # a coefficient that is zero by symmetry is only rounding
+        if self._kind == "bifurcation":
+            # where all coefficients of v . R_mu are zero by symmetry, they are only rounding, which
+            # must not be scaled up
             row_sizes[1] = max(row_sizes[1], self._mixed_size * units[2])
         rows /= np.where(row_sizes, row_sizes, 1.0)[:, None]
-        # where bifurcations meet by symmetry the rows are dependent: the least step is taken
+        # where bifurcations meet by symmetry the rows are dependent: least squares then take the
+        # smallest step
         rank_tolerance = SYMMETRY_TOLERANCE if self._kind != "fold" else None
         solution = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rank_tolerance)[0]
         return np.asarray(units * solution)
@@ -357,13 +368,14 @@ class AugmentedRows:
     ) -> list[float]:
         """Return the row v . R_mu = 0: coefficients of dmu, dp and alpha, and the constant term.
 
-        Its change is v . R_mu' + v' . R_mu. The null vector changes by v' = -K^-1 K' v, so the
-        second part is -w_mu . K' v.
+        A prime is a change along the step. v . R_mu changes by v . R_mu' + v' . R_mu. The null
+        vector changes by v' = -K^-1 K' v, so the second part is -w_mu . K' v.
 
         Parameters
         ----------
         coefficients
-            Returns the row of the product c . du with a vector c.
+            Called with a vector c. It returns the product c . du: its coefficients of dmu, dp and
+            alpha, and its constant term.
         pull
             The value of v . R_mu at the state.
         """
@@ -377,7 +389,8 @@ class AugmentedRows:
             system.load(state.u, {**state.mu, name: mu + step}, name)
             for step in (mu_step, -mu_step)
         )
-        # the derivatives of v . R_mu by mu and p at fixed u: of the load, and of the null vector
+        # the derivatives of v . R_mu by mu and p at fixed u, each with the two parts that the load
+        # and the null vector contribute
         load_mu = np.asarray((forward - backward) / (2 * mu_step))
         by_mu = dot(comm, v, load_mu) - dot(comm, w_mu, self.K_mu_v)
         loads = [
@@ -386,6 +399,7 @@ class AugmentedRows:
         ]
         load_p = np.asarray(np.sum(loads, axis=0))
         by_p = dot(comm, v, load_p) - dot(comm, w_mu, self.K_p_v)
+        # the derivative by u is -mixed
         mixed_row = coefficients(mixed)
         return [by_mu - mixed_row[0], by_p - mixed_row[1], -mixed_row[2], pull - mixed_row[3]]
 
@@ -393,8 +407,8 @@ class AugmentedRows:
 def second_eigenvalue(tangent: AugmentedTangent, system: System) -> float:
     """Return the eigenvalue of K nearest to zero in the space orthogonal to b. Collective.
 
-    A power iteration of the bordered inverse finds it, in a fixed number of steps: its error is
-    not needed, only where its sign changes.
+    A power iteration of the bordered inverse finds it, in a fixed number of steps. No error is
+    estimated, because only the place where the eigenvalue changes its sign matters.
     """
     # a start vector that no symmetry makes orthogonal to a mode, always the same
     x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)

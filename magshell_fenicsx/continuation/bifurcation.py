@@ -10,11 +10,12 @@ the force along v that restores it (Govaerts, Numerical methods for bifurcations
 equilibria, SIAM 2000, ch. 4 and 6). `switch_branch` enters the branches that cross the path there.
 
 Pi(u; mu) is the potential, R = dPi/du, K = dR/du; mu is the load parameter (amplitude) that varies,
-R_mu its load vector. A dot is the inner product over all ranks; Pi'''(v, w, .) is a third
-derivative as a vector. phi is the null vector of K. w_R and w_mu solve K w + t b = R and R_mu with
-b . w = 0. The system's length (a thickness) is the unit of displacements. `stress` is a list of
-weighted displacements: K takes the sum of their stresses in place of the stress of u, since small
-errors of a guess u change its own stress much.
+by `name`, R_mu its load vector. `newton` is the solver of the system with its factorisation. A dot
+is the inner product over all ranks; Pi'''(v, w, .) is a third derivative as a vector. phi is the
+null vector of K. w_R and w_mu solve K w + t b = R and R_mu with b . w = 0. The system's length (a
+thickness) is the unit of displacements. `stress` is a list of weighted displacements: K takes the
+sum of their stresses in place of the stress of u, since small errors of a guess u change its own
+stress much.
 """
 
 from collections.abc import Callable, Sequence
@@ -114,7 +115,8 @@ def find_bifurcation(
     phi
         A vector near the null vector of the tangent.
     stress
-        Weighted displacements whose stress replaces that of the guess in the first tangent.
+        Pairs of a weight and a displacement: in the first tangent the weighted sum of their
+        stresses replaces the stress of the guess.
 
     Raises
     ------
@@ -122,6 +124,7 @@ def find_bifurcation(
         If Newton's method diverges or takes too long, or the tangent is singular in two directions.
     """
     try:
+        # the equilibrium near the guess, and its error
         start, _ = _equilibrate(newton, guess, phi, stress)
         return _find_from_equilibrium(newton, start, phi, name)
     except np.linalg.LinAlgError:
@@ -144,8 +147,10 @@ def _find_from_equilibrium(
         If the tangent is singular in two directions.
     """
     system, state, count = newton.system, guess, newton.factorisation.count
+    # b: the border of the tangent; sizes, load_changes: of the steps so far, in lengths and in mu
     b, sizes, load_changes = phi, list[float](), list[float]()
-    # K is not linear in an amplitude that is a position: convergence of u does not show that of mu
+    # K is not linear in an amplitude that is a prescribed position (one of the system's
+    # `coordinates`): there the convergence of u does not show that of mu
     checks_load = name in system.coordinates
     while not (
         _has_converged(sizes)
@@ -162,7 +167,8 @@ def _find_from_equilibrium(
             raise BifurcationLost
         last_u, state = state.u, state.with_(state.u + du, name, state.mu[name] + dmu)
         if sizes[-1] > EQUILIBRIUM_STEP:
-            # off equilibrium the membrane stress is wrong, and with it the tangent
+            # off equilibrium the membrane stress is wrong, and with it the tangent: that of the
+            # first iteration takes a stress extrapolated along the step
             state, _ = _equilibrate(newton, state, tangent.v, extrapolated_stress(last_u, du))
     state, error = _equilibrate(newton, state, tangent.v)
     return Bifurcation(
@@ -182,7 +188,8 @@ def _equilibrate(
 ) -> tuple[State, float]:
     """Return the equilibrium near a state up to a force along v, and its error in lengths.
 
-    The force keeps the component of the state along v.
+    The force keeps the component of the state along v. In the first tangent `stress`, pairs of a
+    weight and a displacement, replace the stress of the state.
 
     Raises
     ------
@@ -209,8 +216,10 @@ def _newton_step(
         The augmented tangent at the state.
     """
     comm, u, v = system.comm, state.u, tangent.v
+    # responses w orthogonal to b, and the part v . R_mu of the load that K cannot balance
     w_R, _ = tangent.solve(system.residual(u, state.mu))
-    w_mu, work = tangent.solve(system.load(u, state.mu, name))  # work = v . R_mu
+    w_mu, work = tangent.solve(system.load(u, state.mu, name))
+    # Pi'''(v, v, .), then (dK/dmu) v as the derivative of R_mu along v
     cubic = third_derivative(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     mixed = mixed_third_derivative(system, state, v, w_mu) - K_mu_v  # -d(v . R_mu)/du
@@ -229,11 +238,11 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
 
     It is exactly zero for an amplitude that multiplies its term.
     """
-    mu, d = state.mu[name], DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
+    mu, mu_step = state.mu[name], DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
     forward, backward = (
-        system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d)
+        system.load(state.u, {**state.mu, name: mu + step}, name) for step in (mu_step, -mu_step)
     )
-    return np.asarray((forward - backward) / (2 * d))
+    return np.asarray((forward - backward) / (2 * mu_step))
 
 
 def mixed_third_derivative(
@@ -250,14 +259,15 @@ def mixed_third_derivative(
         The residual at the state; None: it is computed.
     """
     comm = system.comm
-    size = max_abs(comm, w) / max_abs(comm, v)
-    if size == 0.0:  # w is zero
+    ratio = max_abs(comm, w) / max_abs(comm, v)
+    if ratio == 0.0:  # w is zero
         return np.zeros_like(v)
     residual = system.residual(state.u, state.mu) if residual is None else residual
+    # along v + w and v - w, with w over the ratio
     plus, minus = (
-        third_derivative(system, state, v + sign * w / size, residual) for sign in (1, -1)
+        third_derivative(system, state, v + sign * w / ratio, residual) for sign in (1, -1)
     )
-    return np.asarray(size / 4 * (plus - minus))
+    return np.asarray(ratio / 4 * (plus - minus))
 
 
 def _has_converged(sizes: Sequence[float]) -> bool:
@@ -275,7 +285,9 @@ def _has_converged(sizes: Sequence[float]) -> bool:
 
 
 def _load_has_converged(changes: Sequence[float], mu: float) -> bool:
-    """Return whether the last change of the amplitude is converged, or as small as rounding.
+    """Return whether the last change of the amplitude is below the tolerance, or only rounding.
+
+    A small change that is not half as large as the one before counts as rounding.
 
     Parameters
     ----------
@@ -312,8 +324,9 @@ def switch_branch(
 ) -> BranchSwitch | None:
     """Leave a path at a located bifurcation along the null vector. Collective.
 
-    Points are solved at a distance along the null vector, in both directions. Distances grow until
-    the amplitude changes by more than rounding, and are tried smaller if the first one fails.
+    Points are solved at a distance along the null vector, in both directions. The distance grows
+    until the amplitude changes by more than rounding. If no points are found at the first distance,
+    smaller ones are tried.
 
     Parameters
     ----------
@@ -332,11 +345,13 @@ def switch_branch(
         mode = critical_mode(path.newton, state).vector
     except NoEigenpair:
         return None
+    # its largest entry is one length of the system, positive on any number of ranks
     mode = np.asarray(mode * path.system.length / largest_entry(path.system.comm, mode))
     branch_switch = None
-    sizes = list(FIRST_STEP_SIZES)
+    sizes = list(FIRST_STEP_SIZES)  # the distances still to be tried
     while sizes:
         size = sizes.pop(0)
+        # a point in each direction; None if it is not found or refused
         points = (_step_off(path, state, mode, signed) for signed in (size, -size))
         start, opposite_start = (
             point if point and not refused(bifurcation, point) else None for point in points
@@ -352,7 +367,8 @@ def switch_branch(
         )
         symmetric = abs(rise - opposite_rise) <= ASYMMETRY_TOLERANCE * abs(rise + opposite_rise)
         branch_switch = BranchSwitch(symmetric, (start, opposite_start))
-        # a smaller change is rounding, which would decide on the symmetry: a larger distance then
+        # a smaller change of the amplitude is rounding, which must not decide on the symmetry: then
+        # a larger distance is tried
         largest_rise = max(abs(rise), abs(opposite_rise))
         changes_load = largest_rise > LOAD_CHANGE_TOLERANCE * abs(state.mu[name])
         if size < FIRST_STEP_SIZES[0] or changes_load:
@@ -390,15 +406,16 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
     The point, with arc length zero; None if it is not found.
     """
     metric, name, newton = path.metric, path.name, path.newton
+    # the row <mode, u - u of the state> = distance
     distance = size * metric.inner((mode, 0.0), (mode, 0.0))
-    row = Hyperplane(metric, name, state, (mode, 0.0), distance)
+    row = Hyperplane(metric, name, base=state, normal=(mode, 0.0), distance=distance)
     try:
         pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
     except np.linalg.LinAlgError:  # singular in another direction too
         return None
     if pushed is None:
         return None
-    pushed_state, _ = pushed
+    pushed_state, _ = pushed  # and its error
     point = path.solve(row, 0.0, pushed_state)
     if isinstance(point, str):
         return None

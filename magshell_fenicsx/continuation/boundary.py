@@ -1,16 +1,17 @@
 """Boundaries of stability: a fold or a bifurcation continued in a second parameter p.
 
-Both are curves in (u, mu, p), see `augmented` and, for symmetry-breaking modes,
-`symmetry_breaking`. They are followed by arc length, through turning points of p; cubics predict.
-Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v
-alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a
+Both are curves in (u, mu, p), whose equations `augmented` has, and `symmetry_breaking` for
+symmetry-breaking modes. They are followed by arc length, through turning points of p; cubics
+predict. Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes
+along v alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a
 bifurcation.
 
 A `BoundaryPoint` has the state, the null vector phi of K and the boundary's tangent `way`; a
 `CurveVector` (du, dmu, dp) is a direction or, as a prediction, a point (u, mu, p). mu is the one
-unknown load parameter (amplitude), by name. A row is the scalar equation that says where on the
-boundary a point is. R = dPi/du, K = dR/du, v is phi with another scale; Pi''' is the third
-derivative of the potential. Numbers of unstable directions never count phi.
+unknown load parameter (amplitude), by name. `low` and `high` are two successive points, a guess the
+predicted (u, mu, p). A row is the scalar equation that says where on the boundary a point is. R =
+dPi/du, K = dR/du, v is phi with another scale; Pi''' is the third derivative of the potential.
+Numbers of unstable directions never count phi.
 
 `family` is a `SystemFamily`: one system for each p, costly if each is made anew. A family of modes,
 by number, shares a tangent: 0 the model's own modes, 1, 2, ... symmetry-breaking modes, which the
@@ -106,8 +107,8 @@ class Boundary:
         Whether symmetry-breaking modes are counted along a boundary of the model itself.
 
     Private fields: `_counts_families` tells whether symmetry-breaking modes are counted at points.
-    `_weight` is the factor of du . du in the metric, `_length` the system's length; `start` sets
-    both. `_solved_at` are the values of p of all solved points.
+    `start` sets `_weight`, the factor of du . du in the metric, `_length`, the system's length, and
+    `_comm`, its communicator. `_solved_at` are the values of p of all solved points.
     """
 
     def __init__(
@@ -162,7 +163,7 @@ class Boundary:
                 "a load without potential: its tangent is not symmetric, "
                 "and no boundary is followed"
             )
-        point = self._solve(p, state, phi, _row_at(p), None)
+        point = self._solve(p, state, b=phi, row=_row_at(p), neighbour=None)
         if isinstance(point, str):
             raise BoundaryLost(f"the {self.kind} at {p:.6g} is not found again: {point}")
         return replace(point, p=p)
@@ -194,7 +195,7 @@ class Boundary:
         current = start if start.way.dp * sense >= 0 else _reversed(start)
         previous: tuple[BoundaryPoint, float] | None = None  # the previous point, and its step
         max_dp = self.scales[1] / steps
-        # the arc length that changes p by `max_dp`, but at most 10/steps
+        # the arc length that changes p by `max_dp`, at most 10/steps where p hardly changes
         first_length = min(
             max_dp / max(abs(current.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5
         )
@@ -209,7 +210,8 @@ class Boundary:
                     yield from self._events_between(current, end_point, distance)
                     yield "end", end_point
                     return
-            # a point, or the reason why there is none
+            # the next point, or the reason why there is none: first that of a guess outside the
+            # range, behind which no end point was found
             point: BoundaryPoint | str = "the end of the range is not reached at once"
             if guess_is_inside:
                 point = self._correct(current, guess, length)
@@ -221,23 +223,32 @@ class Boundary:
                         f"at {current.p:.6g}, load {current.state.mu[self.name]:.6g}: {point}"
                     )
                 continue
-            if not ends[0] < point.p < ends[1]:  # the prediction had not shown it
+            if not ends[0] < point.p < ends[1]:  # outside the range, though its guess was inside
                 length /= 2
                 continue
             step = self._distance(current, point, length)
             yield from self._events_between(current, point, step)
             yield "point", point
-            # easy steps on a straight stretch grow, hard ones shrink
-            straight = self.inner(current.way, point.way) > GROWTH_COSINE
+            length = min(
+                self._adapted_length(length, current, point, max_dp), 3 * first_length, 2 * step
+            )
             previous, current = (current, step), point
-            if point.factorisations <= EASY_ITERATIONS and straight:
-                length = 1.5 * length
-            elif point.factorisations > 2 * EASY_ITERATIONS:
-                length = 0.7 * length
-            # the next step changes p by little more than `max_dp`
-            max_length = 1.2 * max_dp / max(abs(current.way.dp), 1e-300)
-            length = min(length, max_length, 3 * first_length, 2 * step)
         raise BoundaryLost(f"{MAX_POINTS} points have not reached the end of the range")
+
+    def _adapted_length(
+        self, length: float, low: BoundaryPoint, high: BoundaryPoint, max_dp: float
+    ) -> float:
+        """Return the length of the step from `high`, after a step of `length` from `low` to it.
+
+        Easy steps on a straight stretch grow, hard ones shrink. The new step changes p by little
+        more than `max_dp`.
+        """
+        is_straight = self.inner(low.way, high.way) > GROWTH_COSINE
+        if high.factorisations <= EASY_ITERATIONS and is_straight:
+            length = 1.5 * length
+        elif high.factorisations > 2 * EASY_ITERATIONS:
+            length = 0.7 * length
+        return min(length, 1.2 * max_dp / max(abs(high.way.dp), 1e-300))
 
     def _events_between(
         self, low: BoundaryPoint, high: BoundaryPoint, length: float
@@ -260,7 +271,7 @@ class Boundary:
         if self._counts_families:
             yield from self._crossings_between(low, high, length)
         elif low.unstable != high.unstable:
-            point = self._locate_meeting(low, high, length, lambda point: point.unstable)
+            point = self._locate_meeting(low, high, length, count=lambda point: point.unstable)
             if point:
                 yield "meeting", point
 
@@ -278,18 +289,19 @@ class Boundary:
         changed_families = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
         located = {
             i: self._locate_meeting(
-                low, high, length, partial(BoundaryPoint.unstable_of, family=i), i
+                low, high, length, count=partial(BoundaryPoint.unstable_of, family=i), family=i
             )
             for i in changed_families
         }
         events = [(i, point) for i, point in located.items() if point]
-        # in the order of p, with the counts just before each point
+        # in the order of p; `counts` are those of all families just before each point
         counts = [low.unstable_of(i) for i in families]
         for i, point in sorted(events, key=lambda event: abs(event[1].p - low.p)):
             if i == self.m == 0:  # a mode of the model, on a boundary of the model
                 yield "meeting", replace(point, met=i)
             else:
-                # its own counts are those of a nearby point, which may be beyond other crossings
+                # the located point has counts of a nearby point, which may lie beyond other
+                # crossings: they are replaced
                 unstable = sum(counts)
                 yield "crossing", replace(point, met=i, counts=tuple(counts), unstable=unstable)
             counts[i] = high.unstable_of(i)
@@ -313,7 +325,8 @@ class Boundary:
                 current.p + length * tangent.dp,
             )
         low, step = previous
-        # in units of the last step, along its own tangent
+        # the place on the cubic: 0 at the previous point, 1 at the current one. The length along
+        # the current tangent is projected on the tangent of the previous point
         t = 1 + length * self.inner(low.way, current.way) / step
         return self._hermite(low, current, step, t)
 
@@ -330,11 +343,12 @@ class Boundary:
             The place in units of the step: 0 at the first point, 1 at the second.
         """
         name = self.name
-        # the second tangent has length one too: per unit of the first it is longer
-        faster = 1 / self.inner(low.way, high.way)
-        # weights of the values and of the slopes in units of the step, then of both tangents
+        # the second tangent has length one; per unit of distance along the first it is longer
+        stretch = 1 / self.inner(low.way, high.way)
+        # weights of the values at both points, and of the slopes per unit of t
         (low_weight, low_slope_weight), (high_weight, high_slope_weight) = hermite(t, (0.0, 1.0))
-        a, b = step * low_slope_weight, step * faster * high_slope_weight
+        # weights of both tangents, which are slopes per unit of distance
+        a, b = step * low_slope_weight, step * stretch * high_slope_weight
 
         def cubic(x0: float, d0: float, x1: float, d1: float) -> float:
             """Return the value for the values x0, x1 and slopes d0, d1 at both points."""
@@ -383,7 +397,7 @@ class Boundary:
         """
         if not self._is_taken_at_given_p(current):
             return length
-        # at a given p the distance follows from the solution
+        # at a given p the distance was not prescribed: it follows from the solution
         name = self.name
         chord = CurveVector(
             next_point.state.u - current.state.u,
@@ -427,9 +441,9 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Return a point with the second eigenvalue of a family, or the reason why there is none.
 
-        The point is at the distance `s` from a base. On a boundary of symmetry-breaking modes
-        (m > 0), whose equations do not couple with another family, it is solved at the p of the
-        guess where that is cheaper.
+        The point is at the distance `s` from a base. A boundary of symmetry-breaking modes (m > 0)
+        has equations that do not couple with another family. Its point is solved at the p of the
+        guess instead, where that is cheaper.
         """
         if not (self.m and self._is_taken_at_given_p(base)):
             return self._correct_at_distance(base, guess, s, eigenvalue_family=family)
@@ -463,11 +477,11 @@ class Boundary:
         """
         name = self.name
         point = self._solve(
-            guess.dp,
-            State(guess.du, {name: guess.dmu}),
-            base.phi,
-            row,
-            base,
+            p=guess.dp,
+            state=State(guess.du, {name: guess.dmu}),
+            b=base.phi,
+            row=row,
+            neighbour=base,
             eigenvalue_family=eigenvalue_family,
             low_order=low_order,
         )
@@ -516,14 +530,15 @@ class Boundary:
         guess = self._predict(previous, current, outside)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
         point = self._solve(
-            end,
-            State(guess.du, {self.name: guess.dmu}),
-            current.phi,
-            _row_at(end),
-            current,
+            p=end,
+            state=State(guess.du, {self.name: guess.dmu}),
+            b=current.phi,
+            row=_row_at(end),
+            neighbour=current,
             low_order=self._is_taken_at_given_p(current),
         )
-        # behind a turn, on a sharp bend or far from the prediction: another part of the boundary
+        # a point behind a turn, behind a sharp bend or far from the guess lies on another part of
+        # the boundary
         if isinstance(point, str) or point.way.dp * current.way.dp < 0:
             return None
         if self.inner(point.way, current.way) < MIN_COSINE:
@@ -546,17 +561,18 @@ class Boundary:
         length
             Distance of the points along the tangent of the first.
         """
-        base, a, b = low, 0.0, length  # a, b: distances of both along the tangent of the base
+        # a, b: distances of `low` and `high` along the tangent of the base, the first point
+        base, a, b = low, 0.0, length
         best = min(low, high, key=lambda point: abs(point.way.dp))
         for _ in range(MAX_TRIALS):
             # slopes of p by the distance along the tangent of the base
             d0, d1 = (point.way.dp / self.inner(base.way, point.way) for point in (low, high))
             s = a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)
-            # the step and the place in it, as `_hermite` measures them: from `low`
+            # the step is measured along the tangent of `low`; t is the place in it, from 0 to 1
             step, t = (b - a) / self.inner(base.way, low.way), (s - a) / (b - a)
             guess = self._hermite(low, high, step, t)
             middle = self._correct_at_distance(base, guess, s)
-            if isinstance(middle, str):  # rounding: the cubic is as good
+            if isinstance(middle, str):  # rounding prevents a solve: the cubic is as good
                 state = best.state.with_(guess.du, self.name, float(guess.dmu))
                 return replace(best, p=float(guess.dp), state=state)
             best = middle if abs(middle.way.dp) < abs(best.way.dp) else best
@@ -585,10 +601,10 @@ class Boundary:
     ) -> BoundaryPoint | None:
         """Locate the point between two others where a second eigenvalue of a family is zero.
 
-        Inverse interpolation of the eigenvalue finds it. For modes of the boundary's own family or
-        of the model, the equations are singular there, so the point is interpolated between others
-        that are close by. Other families do not couple with them: solved points may be closer.
-        Collective.
+        Inverse interpolation of the eigenvalue finds it. The modes of the boundary's own family and
+        of the model couple with its equations, which are singular there. So the point is
+        interpolated between solved points that are close by. Other families do not couple, and
+        points may be solved much closer to it. Collective.
 
         Parameters
         ----------
@@ -603,14 +619,16 @@ class Boundary:
         -------
         The point; None if no point is found between the two.
         """
-        coupled = family in (0, self.m)
-        tolerance = MEETING_TOLERANCE if coupled else MEETING_TOLERANCE**2
+        is_coupled = family in (0, self.m)
+        tolerance = MEETING_TOLERANCE if is_coupled else MEETING_TOLERANCE**2
         # distances from `low` with their solved points, those with the smallest eigenvalues first
         solved = list[tuple[float, BoundaryPoint]]()
-        # the distances between which the number of unstable directions changes, and the next trial
+        # a, b: distances between which the number of unstable directions changes; s: the next one
+        # at which a point is solved
         a, b, s = 0.0, length, length / 2
         for _ in range(MAX_MEETING_POINTS):
             guess = self._hermite(low, high, length, s / length)
+            # a point with its second eigenvalue; near the meeting there may be none
             point = self._correct_with_eigenvalue(low, guess, s, family)
             if isinstance(point, str):
                 break
@@ -624,12 +642,13 @@ class Boundary:
                 distances = [distance for distance, _ in solved]
                 # inverse interpolation: the distance at which the eigenvalue is zero
                 zero = interpolated([point.second for _, point in solved], distances, 0.0)
-                change = abs(zero - distances[0])
-                outside_by_rounding = not a < zero < b and change < MEETING_TOLERANCE * length
+                is_inside = a < zero < b
+                change = abs(zero - distances[0])  # from the best solved point
+                outside_by_rounding = not is_inside and change < MEETING_TOLERANCE * length
                 if outside_by_rounding or change < tolerance * length:
                     s = zero
                     break
-                s = zero if a < zero < b else s
+                s = zero if is_inside else s  # else bisection
         if len(solved) < 2:  # too few to interpolate
             return solved[0][1] if solved else None
         return self._interpolated_point(solved, s)
@@ -639,15 +658,16 @@ class Boundary:
     ) -> BoundaryPoint:
         """Return the nearest solved point, with p and amplitude interpolated at the distance `s`.
 
-        The amplitude is also interpolated without the last of the solved points. The difference is
-        added to the load error.
+        The amplitude is interpolated a second time without the last of the solved points. The
+        difference of both results is added to the load error.
 
         Parameters
         ----------
         solved
             Pairs of a distance and its point, those with the smallest second eigenvalues first.
         """
-        distances, (_, nearest) = [distance for distance, _ in solved], solved[0]
+        distances = [distance for distance, _ in solved]
+        _, nearest = solved[0]
         loads = [point.state.mu[self.name] for _, point in solved]
         p = interpolated(distances, [point.p for _, point in solved], s)
         load = interpolated(distances, loads, s)
@@ -681,6 +701,7 @@ class Boundary:
         if self.m:
             family = cast(SymmetryBreakingSystems, self.family)
             return SymmetryBreakingRows(newton, state, self.name, b, self.m, family, p, difference)
+        # the unknown amplitude is the same in the systems at all p
         tangent, load = AugmentedTangent(newton, state, b), {self.name: state.mu[self.name]}
         systems = [
             DifferenceSystem(
@@ -715,7 +736,8 @@ class Boundary:
         rows
             Rows of the last step of Newton's method, at the state.
         """
-        if family and not self.m:  # the rows have the model's tangent alone
+        # on a boundary of the model itself the rows know no tangent of a symmetry-breaking family
+        if family and not self.m:
             systems = cast(SymmetryBreakingSystems, self.family)
             return nearest_eigenvalue(systems.factored_tangent(p, state, family), self._comm)
         return rows.eigenvalue(family, p, state)
@@ -793,7 +815,7 @@ class Boundary:
         -------
         Pairs of a weight and its p.
         """
-        # p itself and the last solved values, not too close to one another
+        # p itself and the last solved values of p, not too close to one another
         values = [p]
         min_distance = MIN_SLOPE_DISTANCE * self.scales[1]
         for q in reversed(self._solved_at):
@@ -817,8 +839,8 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Run Newton's method for the point on which a row holds.
 
-        After convergence, a last step with the same matrix reduces the residual, and the rows give
-        the tangent of the boundary.
+        A step of the method solves the augmented equations (`rows`) for (du, dmu, dp). From the
+        equations of the last step `_settled_point` makes the point.
 
         Parameters
         ----------
@@ -845,6 +867,7 @@ class Boundary:
         """
         u, mu, name = state.u, float(state.mu[self.name]), self.name
         difference = self._difference(p, low_order=low_order)
+        # of all steps: sizes of du in lengths of the system, and magnitudes of dmu
         sizes, load_changes = list[float](), list[float]()
         while True:
             newton = self.family.solver_at(p)
@@ -854,36 +877,73 @@ class Boundary:
                 step = rows.step(row, row.value(u, mu, p))
             except np.linalg.LinAlgError:
                 return "the tangent is singular in more than one direction"
-            b = rows.v
+            b = rows.v  # the border of the next matrix
             sizes.append(max_abs(system.comm, step.du) / system.length)
             load_changes.append(abs(step.dmu))
-            if not (sizes[-1] <= MAX_STEP and np.isfinite(step.dmu + step.dp)):
-                return "Newton's method diverges"
-            if len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], TOLERANCE):
+            if _diverges(sizes, step):
                 return "Newton's method diverges"
             u, mu, p = u + step.du, float(mu + step.dmu), float(p + step.dp)
             if self._has_converged(sizes, load_changes):
                 break
             if len(sizes) == MAX_ITERATIONS:
                 return f"Newton's method has not converged in {MAX_ITERATIONS} iterations"
+        point = self._settled_point(
+            rows, row, CurveVector(u, mu, p), neighbour, eigenvalue_family=eigenvalue_family
+        )
+        return point if isinstance(point, str) else replace(point, factorisations=len(sizes))
+
+    def _settled_point(
+        self,
+        rows: AugmentedRows | SymmetryBreakingRows,
+        row: CurveRow,
+        place: CurveVector,
+        neighbour: BoundaryPoint | None,
+        *,
+        eigenvalue_family: int | None,
+    ) -> BoundaryPoint | str:
+        """Return the point of the boundary at a converged place, or why there is none.
+
+        A last step with the same matrix reduces the residual. The same equations give the tangent
+        of the boundary.
+
+        Parameters
+        ----------
+        rows
+            The equations of the last step, with the null vector `rows.v`.
+        row
+            The equation that says where on the boundary the point is.
+        place
+            (u, mu, p) after the last step.
+        neighbour
+            A nearby point, whose null vector and tangent orient those of the result; None: any
+            sign.
+        eigenvalue_family
+            The family whose second eigenvalue is computed; None: none.
+
+        Returns
+        -------
+        The point, without its number of factorisations; or the reason why there is none.
+        """
+        name, comm, u, mu, p = self.name, self._comm, place.du, place.dmu, place.dp
         last_system = self.family.solver_at(p).system
         rows.set_residual(last_system.residual(u, {**self.family.amplitudes(p), name: mu}))
         last_step = rows.step(row, row.value(u, mu, p), settled=True)
         u, mu, p = u + last_step.du, float(mu + last_step.dmu), float(p + last_step.dp)
-        v = b / np.sqrt(dot(system.comm, b, b))
+        # the null vector of length one, with the orientation that it has at the neighbour
+        v = rows.v / np.sqrt(dot(comm, rows.v, rows.v))
         if neighbour is not None:
-            # the null vector keeps its orientation along the boundary
-            cosine = dot(system.comm, v, neighbour.phi)
+            cosine = dot(comm, v, neighbour.phi)
             if abs(cosine) < MIN_NULL_VECTOR_COSINE:
                 return "the null vector is another one"
             v = v * np.sign(cosine)
-        # the tangent of the boundary, oriented and of length one
+        # the tangent of the boundary: a solution without value of the row
         direction = rows.step(row, None)
+        # divided by this norm it has length one, and the orientation of the neighbour's
         norm = np.sqrt(self.inner(direction, direction))
         if neighbour is not None and self.inner(direction, neighbour.way) < 0:
             norm = -norm
-        # b . v = 1 scales the vector of the rows, v has length one
-        scale = dot(system.comm, rows.v, v)
+        # `bend` and `pull` of the rows are those of `rows.v`, which is `scale` times v
+        scale = dot(comm, rows.v, v)
         state = State(u, {**self.family.amplitudes(p), name: mu})
         counts = self._counts(rows, p, state)
         second = np.nan
@@ -900,15 +960,15 @@ class Boundary:
             pull=rows.pull / scale,
             second=second,
             load_error=abs(last_step.dmu) + ROUNDING * abs(mu),
-            factorisations=len(sizes),
+            factorisations=0,
         )
 
     def _has_converged(self, sizes: Sequence[float], load_changes: Sequence[float]) -> bool:
         """Return whether the remaining errors of u and of the load are small.
 
-        Further steps are expected to shrink by the last ratio, or by one half if that is less. Then
-        they sum up to the last step times ratio/(1 - ratio). Steps below the tolerance that shrink
-        slowly are rounding.
+        Further steps are expected to shrink by the ratio of the last two steps, or by one half if
+        that is less. Then they sum up to the last step times ratio/(1 - ratio). Steps below the
+        tolerance that shrink slowly are rounding.
 
         Parameters
         ----------
@@ -926,6 +986,21 @@ class Boundary:
         u_has_converged = sizes[-1] * remaining <= TOLERANCE or is_rounding
         load_error = load_changes[-1] * remaining
         return u_has_converged and (shrinks_slowly or load_error <= LOAD_TOLERANCE * self.scales[0])
+
+
+def _diverges(sizes: Sequence[float], step: CurveVector) -> bool:
+    """Return whether the last step of Newton's method is too long, not finite, or grows.
+
+    Parameters
+    ----------
+    sizes
+        Sizes of du of the steps so far, in lengths of the system.
+    step
+        The last step.
+    """
+    if not (sizes[-1] <= MAX_STEP and np.isfinite(step.dmu + step.dp)):
+        return True
+    return len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], TOLERANCE)
 
 
 def _row_at(p: float) -> CurveRow:

@@ -205,9 +205,10 @@ class _InstabilityLocator:
         single = changed_pivots == 1 or not halvings
         if single and turns_back:
             fold = self.locate_fold(low, high)
-            # without a change of one, the point was not checked by an inertia of its own
+            # if the inertia changes by another number than one, the fold's own tangent is factored
             point = self.with_work(fold) if changed_pivots == 1 else self.with_own_inertia(fold)
-            # rounding decides what its own matrix counts
+            # the tangent at a fold is singular, so that rounding would decide on its inertia: the
+            # fold has the inertia of the first end
             point = replace(
                 point,
                 negative_pivots=low.negative_pivots,
@@ -216,7 +217,7 @@ class _InstabilityLocator:
             yield Instability(point, "fold")
         elif single:
             point = self.solve_bifurcation(low, high) or self.bisect_bifurcation(low, high)
-            # at a bifurcation the load still changes along the path
+            # at a bifurcation the load still changes along the path; at a fold it does not
             if abs(point.dmu) < FOLD_SLOPE_RATIO * abs(low.dmu):
                 raise PathStopped("the step passed a fold and left the branch", low)
             yield Instability(point, "bifurcation")
@@ -305,19 +306,23 @@ class _InstabilityLocator:
         except NoEigenpair:
             return None
         a, b = (mode.eigenvalue for mode in modes)
-        # the zero between both by linear interpolation; with one sign they show nothing
+        # t: place of the zero between both ends by linear interpolation of the eigenvalue; two
+        # eigenvalues of one sign do not show it, and the middle is taken
         t = a / (a - b) if a * b < 0 else 0.5
         guess = path.interpolated_state(low.s + t * (high.s - low.s), low, high)
-        stress = [(1 - t, low.state.u), (t, high.state.u)]
+        # the first tangent takes the stress interpolated between both ends
+        stress_sources = [(1 - t, low.state.u), (t, high.state.u)]
         least_pivots, most_pivots = sorted(end.negative_pivots for end in (low, high))
         for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
-            solve = partial(self._regular_solution, guess, mode.vector, stress, low, high)
+            solve = partial(self._regular_solution, guess, mode.vector, stress_sources, low, high)
+            # a point, or the reason why there is none; the journal records it
             point = path.recorded(solve)
             if isinstance(point, str):
                 continue
             if not min(low.s, high.s) <= point.s <= max(low.s, high.s):
                 continue
-            # its own null vector does not count, so the larger number is excluded
+            # the inertia of the point does not count its null vector: it is at least that of one
+            # end, and below that of the other end
             if not least_pivots <= point.negative_pivots < most_pivots:
                 continue
             if not self.is_on_another_branch(point, low, high):
@@ -328,7 +333,7 @@ class _InstabilityLocator:
         self,
         guess: State,
         phi: Vector,
-        stress: Sequence[WeightedDisplacement],
+        stress_sources: Sequence[WeightedDisplacement],
         low: Point,
         high: Point,
     ) -> Point | str:
@@ -336,8 +341,11 @@ class _InstabilityLocator:
 
         Parameters
         ----------
-        guess, stress
-            A state near the bifurcation, and weighted displacements whose stress replaces its own.
+        guess
+            A state near the bifurcation.
+        stress_sources
+            Pairs of a weight and a displacement. In the first tangent the weighted sum of their
+            stresses replaces the stress of the guess.
         phi
             A vector near the null vector.
         low, high
@@ -349,13 +357,13 @@ class _InstabilityLocator:
         """
         path = self.path
         try:
-            bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress)
+            bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress_sources)
         except BifurcationLost:
             return "no bifurcation was found"
         self.iterations += bifurcation.iterations
         self.factorisations += bifurcation.factorisations
-        # the null vector and the response span the tangents of both branches; this one continues
-        # the path
+        # two branches cross here: their tangents are combinations of the null vector and of the
+        # response to the load. The combination nearest to the path's tangent continues this path
         state, tangent = bifurcation.state, self._interpolated_tangent(bifurcation.state, low, high)
         direction = nearest_combination(
             path.metric, tangent, [(bifurcation.phi, 0.0), (-bifurcation.response, 1.0)]
@@ -431,8 +439,9 @@ class _InstabilityLocator:
     def locate_fold(self, low: Point, high: Point) -> Point:
         """Return the point between two others where dmu/ds is zero.
 
-        The stationary place of the cubic through both ends is solved at, and replaces one end,
-        until the estimated error of the amplitude is below the tolerance.
+        The cubic mu(s) through both ends has a stationary place between them. The path is solved at
+        that s, and the solution replaces one end. This is repeated until the estimated error of the
+        amplitude is below the tolerance.
 
         Raises
         ------
@@ -472,7 +481,7 @@ class _InstabilityLocator:
             Upper bound of the distance, which is returned if the slope is unknown.
         """
         u = point.state.u
-        # u with each entry one unit in the last place larger or smaller, twice
+        # two copies of u, with each entry one unit in the last place larger or smaller, at random
         random = np.random.default_rng(self.path.system.comm.rank)
         rounded = [u + signs * np.spacing(u) for signs in random.choice([-1.0, 1.0], (2, u.size))]
         eigenvalues = [
@@ -480,16 +489,18 @@ class _InstabilityLocator:
         ]
         if not slope:
             return upper_bound
+        # the eigenvalue itself, and the scatter of the three
         error = abs(eigenvalues[0]) + LOAD_ERROR_FACTOR * np.ptp(eigenvalues)
         return float(error / abs(slope))
 
     def locate_zero_eigenvalue(self, low: Point, high: Point, stability: Stability) -> Point:
         """Return the point between two others where an eigenvalue of `stability` is zero.
 
-        Illinois' regula falsi is of order 1.44: if two successive guesses agree to tolerance^(3/4),
-        the error of the second is below the tolerance. While the eigenvalue shows a larger error,
-        the search goes on as long as the error is halved: close to zero it is only rounding. The
-        `load_error` of the point is valid even if the tolerance is not reached.
+        The Illinois variant of regula falsi is of order 1.44: if two successive guesses agree to
+        tolerance^(3/4), the error of the second is below the tolerance. If the eigenvalue there
+        shows a larger error, the search goes on as long as each step halves that error. An error
+        that is not halved is rounding. The `load_error` of the point is valid even if the tolerance
+        is not reached.
 
         Parameters
         ----------
@@ -501,61 +512,106 @@ class _InstabilityLocator:
         NoEigenpair
             If the eigenpair nearest to zero is not found at a point.
         """
-        # last_side: which end the last point replaced, 1 for high, -1 for low, 0 for none yet
-        name, last_side, last_s = self.path.name, 0, np.inf
+        name, last_s = self.path.name, np.inf
         best: Point | None = None  # the last guess that agreed with the one before
         low_mode = critical_mode(stability, low.state)
-        # a, b: the eigenvalues at both ends, which are halved below; `ends` keeps them with loads
-        a, b = low_mode.eigenvalue, critical_mode(stability, high.state).eigenvalue
-        ends = (low.state.mu[name], a), (high.state.mu[name], b)
+        high_mode = critical_mode(stability, high.state)
+        bracket = _EigenvalueBracket(name, low, high, low_mode.eigenvalue, high_mode.eigenvalue)
         for _ in range(MAX_TRIALS):
-            # the eigenvalue nearest to zero need not be the one that changes sign
-            t = a / (a - b) if a * b < 0 else 0.5
-            result = self.try_solve(low.s + t * (high.s - low.s), low, high)
+            low, high = bracket.low, bracket.high
+            result = self.try_solve(bracket.next_place, low, high)
             point = self.middle(low, high) if isinstance(result, str) else result
             if point is None:  # the path's own tangent is singular there as well
                 break
             mu = point.state.mu[name]
+            # in the load: distance from the last guess, and width of the bracket
             load_change = abs(point.s - last_s) * abs(point.dmu)
             width = abs(high.s - low.s) * abs(point.dmu)
             # two successive guesses agree
-            if load_change <= self.tolerance**0.75 * abs(mu) and a * b < 0:
-                load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
+            if load_change <= self.tolerance**0.75 * abs(mu) and bracket.changes_sign:
+                load_error = self.distance_to_zero(point, stability, bracket.slope, width)
                 zero = replace(point, load_error=load_error)
                 stalled = best and load_error > best.load_error / 2
                 if stalled or load_error <= self.tolerance * abs(mu):
                     return min(best or zero, zero, key=lambda point: point.load_error)
                 best = zero  # the next guess, from the other side, may be nearer
-            # the bracket is small enough without such guesses
+            # no two guesses agree, but the bracket itself is small enough
             if width <= self.tolerance * abs(mu) and not best:
-                load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
+                load_error = self.distance_to_zero(point, stability, bracket.slope, width)
                 return replace(point, load_error=max(width, load_error))
+            # the point replaces the end that has the same inertia
             last_s, mode = point.s, critical_mode(stability, point.state)
-            # Illinois: the value at an end that stays twice in turn is halved
-            if mode.negative_pivots != low_mode.negative_pivots:
-                high, b = point, mode.eigenvalue
-                ends = ends[0], (mu, b)
-                a = a / 2 if last_side == 1 else a
-                last_side = 1
-            else:
-                low, a = point, mode.eigenvalue
-                ends = (mu, a), ends[1]
-                b = b / 2 if last_side == -1 else b
-                last_side = -1
+            is_behind = mode.negative_pivots != low_mode.negative_pivots
+            bracket.replace_end(point, mode.eigenvalue, is_high=is_behind)
+        low, high = bracket.low, bracket.high
         return best or replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))
 
 
-def _slope(low: tuple[float, float], high: tuple[float, float]) -> float:
-    """Return the slope d(eigenvalue)/d(load) between two pairs of a load and its eigenvalue.
+class _EigenvalueBracket:
+    """Two points between which an eigenvalue is zero, and the Illinois variant of regula falsi.
 
-    It is zero if both eigenvalues have one sign: then they do not belong to one mode.
+    Parameters
+    ----------
+    name
+        The amplitude, which is the load.
+    low, high
+        The points.
+    low_value, high_value
+        The eigenvalues there.
+
+    Private fields: `_low_end` and `_high_end` are pairs of the load and the eigenvalue at the
+    points. `_low_value` and `_high_value` are the values that are interpolated: the eigenvalues,
+    one of which may be halved. `_last_side` tells which point was replaced last: 1 for `high`, -1
+    for `low`, 0 for none.
     """
-    (low_load, low_eigenvalue), (high_load, high_eigenvalue) = low, high
-    return (
-        (high_eigenvalue - low_eigenvalue) / (high_load - low_load)
-        if low_eigenvalue * high_eigenvalue < 0 and low_load != high_load
-        else 0.0
-    )
+
+    def __init__(
+        self, name: str, low: Point, high: Point, low_value: float, high_value: float
+    ) -> None:
+        self.low, self.high, self._name, self._last_side = low, high, name, 0
+        self._low_value, self._high_value = low_value, high_value
+        self._low_end = low.state.mu[name], low_value
+        self._high_end = high.state.mu[name], high_value
+
+    @property
+    def changes_sign(self) -> bool:
+        """Whether the two eigenvalues have opposite signs; else they belong to different modes."""
+        return self._low_value * self._high_value < 0
+
+    @property
+    def next_place(self) -> float:
+        """The s at which to solve next: the zero by linear interpolation, or else the middle."""
+        a, b = self._low_value, self._high_value
+        t = a / (a - b) if self.changes_sign else 0.5
+        return self.low.s + t * (self.high.s - self.low.s)
+
+    @property
+    def slope(self) -> float:
+        """Slope d(eigenvalue)/d(load) between the points.
+
+        It is zero if both eigenvalues have one sign: then they do not belong to one mode.
+        """
+        (low_load, low_eigenvalue), (high_load, high_eigenvalue) = self._low_end, self._high_end
+        return (
+            (high_eigenvalue - low_eigenvalue) / (high_load - low_load)
+            if low_eigenvalue * high_eigenvalue < 0 and low_load != high_load
+            else 0.0
+        )
+
+    def replace_end(self, point: Point, eigenvalue: float, *, is_high: bool) -> None:
+        """Replace one end by a point with its eigenvalue: `high` if `is_high`, else `low`.
+
+        If the other end stays for the second time in turn, its interpolated value is halved.
+        """
+        load = point.state.mu[self._name]
+        if is_high:
+            self.high, self._high_value, self._high_end = point, eigenvalue, (load, eigenvalue)
+            self._low_value = self._low_value / 2 if self._last_side == 1 else self._low_value
+            self._last_side = 1
+        else:
+            self.low, self._low_value, self._low_end = point, eigenvalue, (load, eigenvalue)
+            self._high_value = self._high_value / 2 if self._last_side == -1 else self._high_value
+            self._last_side = -1
 
 
 def _stationary_place(
@@ -569,8 +625,9 @@ def _stationary_place(
         Called with the mean slope of mu and its slopes at both ends. It returns the fraction of the
         interval at which mu is stationary, 0 to 1: `stationary` or `kink`.
     """
-    L = high.s - low.s
-    return low.s + L * find((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
+    length = high.s - low.s
+    mean_slope = (high.state.mu[name] - low.state.mu[name]) / length
+    return low.s + length * find(mean_slope, low.dmu, high.dmu)
 
 
 def locate_bifurcation(
@@ -669,6 +726,7 @@ class ContinuationRun:
         is the error of the amplitude.
 
     The private field `_folds` has the located folds, `_budget` the work on the next instability.
+    `_by_arc` tells whether s is the arc length.
     """
 
     def __init__(
@@ -703,9 +761,11 @@ class ContinuationRun:
         # the length of the next step where the last one is rejected, and the reason for that
         shorter_step, reason = None, ""
         while True:
+            # the next points of the path; the base of a step is the point before it
             for point, is_target in self._steps():
                 low, shorter_step = self.path.base_before(self.points[-1], point), None
-                # other amplitudes at the begin of the step, or a step that is too long
+                # `renew` has changed amplitudes at the begin of the step, or refuses its end: the
+                # length of the step that follows instead, and why (or "")
                 renewal = self._renewed_step(low, point)
                 if renewal:
                     shorter_step, new_reason = renewal
@@ -716,7 +776,7 @@ class ContinuationRun:
                 if refusal:  # approach in shorter steps
                     shorter_step, reason = abs(point.s - low.s) / 4, refusal
                     break
-                for label, event, self.done in events:
+                for label, event, self.done in events:  # each tells whether it ends the run
                     yield label, event
                     if label == "fold":
                         self._refuse_loop(event)
@@ -764,7 +824,8 @@ class ContinuationRun:
         try:
             self.points[-1] = self.path.recorrected(low, state)
         except PathStopped as e:
-            # nearer to the first point the change is smaller
+            # no solution with other amplitudes. Unless `renew` now accepts the second point, the
+            # step is shortened: nearer to the first point the amplitudes change by less
             if self._renew and self._renew(low, point):
                 return length / 4, str(e)
             return None
@@ -790,7 +851,8 @@ class ContinuationRun:
             if not (budget.end and budget.clustered):
                 raise
             end = self.path.as_base(self.path.measured_from(current, budget.end))
-            # it is tried once, and the instabilities then count as a cluster
+            # this end is tried once: with no repeated searches left, instabilities that are still
+            # not separated count as a cluster
             budget.repeated, budget.end = MAX_REPEATED_SEARCHES, None
             yield end, end.s in self._remaining_targets()
             yield from self._steps()
@@ -818,6 +880,7 @@ class ContinuationRun:
 
     @property
     def _by_arc(self) -> bool:
+        """Whether s is the arc length, so that steps do not end at targets."""
         return self.path.control == "arc"
 
     def _remaining_targets(self) -> list[float]:
@@ -862,6 +925,7 @@ class ContinuationRun:
             events = self._events_between(low, high)
         except PathStopped as e:  # the step had left the branch
             return [], str(e) if isinstance(e, TargetMissed) else "an instability cannot be located"
+        # the first reason that is not empty, or ""
         refusals = (self._refuse(point) for _, point, _ in events)
         return events, next(filter(None, refusals), "")
 
@@ -895,9 +959,11 @@ class ContinuationRun:
         The folds between the points divide the path: a target just below a fold is passed on both
         sides of it.
         """
-        # the last point is `low`, perhaps with another base direction
+        # the point before `low`, then `low`: it stands for the last of `points`, from which it may
+        # differ in the direction along which arc length is measured
         predictors = [*self.points[-2:-1], low]
         for end in (*(self.path.as_base(fold) for fold in folds), high):
+            # the targets between the last two of these points; all of them serve a guess
             predictors = [*predictors[-2:], end]
             yield from targets_between(
                 self.path, self.goal.quantity, self.goal.targets, self.goal.sense, predictors

@@ -210,7 +210,7 @@ class BorderedMatrix:
 
     Private fields: `_load_response` is K^-1 R_mu, `_schur` the Schur complement d - c . K^-1 R_mu.
     `_weight` is the factor of dmu dmu in `inner`, by which dmu counts as the displacement that it
-    causes. `_gradient` is (c, d), `_mu` the amplitude.
+    causes. `_gradient` is (c, d), `_mu` the amplitude, `_length` the system's length.
     """
 
     def __init__(
@@ -238,6 +238,7 @@ class BorderedMatrix:
         dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
         """
         displacement_per_mu = max_abs(self._comm, self._load_response) / self._length
+        # factor of |dmu|
         scale = min(displacement_per_mu, 1 / abs(self._mu)) if self._mu else displacement_per_mu
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * scale)
 
@@ -250,7 +251,7 @@ class BorderedMatrix:
             Whether a relative residual of about 3 % is enough, where K has a dense part.
         """
         response = self._factors.solve(f, low_accuracy=low_accuracy)
-        # block elimination: the row without dmu, over the Schur complement
+        # block elimination: what K^-1 f leaves of g, over the Schur complement
         dmu = (g - derivative_along(self._comm, self._gradient, (response, 0.0))) / self._schur
         return response - dmu * self._load_response, dmu
 
@@ -274,7 +275,8 @@ class Chord(Generic[V]):
 
     The updates are not stored as a matrix; the steps so far determine them: C. T. Kelley, Iterative
     Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol. Steps are subtracted
-    from the iterate. V is the type of a step.
+    from the iterate. V is the type of a step. The private field `_steps` has the full steps since
+    the matrix was computed.
 
     Parameters
     ----------
@@ -293,7 +295,7 @@ class Chord(Generic[V]):
         add_scaled: Callable[[V, float, V], V],
     ) -> None:
         self._solve, self._inner, self._add_scaled = solve, inner, add_scaled
-        self._steps = list[V]()  # full steps since the matrix was computed
+        self._steps = list[V]()
 
     def accept_step(self, step: V) -> None:
         """Go on to the next iterate by a full step."""
@@ -307,10 +309,10 @@ class Chord(Generic[V]):
         step, inner = self._updated_solution(f, self._steps), self._inner
         if self._steps:
             last_step = self._steps[-1]
-            # Sherman and Morrison's formula for the update by the last step
+            # Sherman and Morrison's formula: the update by the last step makes step/divisor of it
             divisor = 1 - inner(last_step, step) / inner(last_step, last_step)
             if divisor > MIN_BROYDEN_DIVISOR:
-                return self._add_scaled(step, 1 / divisor - 1, step)  # step/divisor
+                return self._add_scaled(step, 1 / divisor - 1, step)
             self._steps.clear()
         return step
 
@@ -325,7 +327,10 @@ class Chord(Generic[V]):
         return self._updated_solution(f, [*self._steps, step])
 
     def _updated_solution(self, f: V, steps: Sequence[V]) -> V:
-        """Return the solution for a right side with the matrix updated by successive steps."""
+        """Return the solution for a right side with the matrix updated by successive steps.
+
+        Each pair of successive steps stands for one update of the inverse, by Kelley's formula.
+        """
         solution, inner = self._solve(f), self._inner
         for earlier, later in pairwise(steps):
             factor = inner(earlier, solution) / inner(earlier, earlier)
@@ -379,8 +384,8 @@ def refined_tangent(
         if system.extrapolation_holds_along(state.u, state.mu, refined[0]):
             return refined
         t = refined
-        # forces computed here make the extrapolation hold along t from now on; the result, from
-        # any vector in place of R, has no meaning
+        # a residual with computed forces at a state along t: from now on the extrapolation uses
+        # them and holds there. The returned product is not used, so any vector serves as R
         refinement.stiffness(system.residual, t[0], t[0])
     return None
 
@@ -410,8 +415,10 @@ class _TangentRefinement:
     def refined(self, residual: Residual, t: Direction) -> Direction | None:
         """Return the tangent for a residual function, by refinement of an approximation.
 
-        The correction is the preconditioned residual z of both equations. Directions p and their
-        images q, the preconditioned matrix times p, are made orthogonal in the images.
+        z is the residual of both equations at the present approximation, preconditioned by the
+        matrix of the nearby state: it estimates the correction that is left. Each new direction p
+        has the image q, the preconditioned matrix times p. The images are made orthogonal to each
+        other.
 
         Parameters
         ----------
@@ -428,7 +435,10 @@ class _TangentRefinement:
         R = residual(self.state.u, self.state.mu)
 
         def preconditioned_product(t: Direction, g: float = 0.0) -> Direction:
-            """Return the preconditioner times the left sides at t, the row's less g."""
+            """Return the preconditioner times (K du + R_mu dmu, c . du + d dmu - g), t = (du, dmu).
+
+            Without g it is the image of a direction, with g = 1 minus the residual z at t.
+            """
             force = self.stiffness(residual, t[0], R) + t[1] * self.load
             row_value = derivative_along(comm, gradient, t) - g
             return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
@@ -437,7 +447,7 @@ class _TangentRefinement:
         # earlier directions p with their images q and q . q
         earlier = list[tuple[Direction, Direction, float]]()
         for _ in range(MAX_REFINEMENTS):
-            # the correction z is small compared with the tangent t, in du and in dmu
+            # converged: the correction z is small compared with the tangent t, in du and in dmu
             size = max_abs(comm, t[0])
             du_converged = max_abs(comm, z[0]) <= DU_TOLERANCE * size
             if du_converged and abs(z[1]) <= DMU_TOLERANCE * abs(t[1]):
@@ -445,18 +455,30 @@ class _TangentRefinement:
                 is_significant = max_abs(comm, z[0]) > DIFFERENCE_ACCURACY * size
                 return add_scaled(t, 1.0, z) if is_significant else t
             # a new direction, whose image is orthogonal to the earlier ones
-            p, q = z, preconditioned_product(z)
-            for earlier_p, earlier_q, earlier_square in earlier:
-                component = self.matrix.inner(earlier_q, q) / earlier_square
-                p = add_scaled(p, -component, earlier_p)
-                q = add_scaled(q, -component, earlier_q)
+            p, q = self._orthogonalised(z, preconditioned_product(z), earlier)
             square = self.matrix.inner(q, q)
             earlier.append((p, q, square))
-            # the step along it that leaves the least of z
+            # a step along p changes z by a multiple of q: the step that leaves the least of z
             component = self.matrix.inner(z, q) / square
             t = add_scaled(t, component, p)
             z = add_scaled(z, -component, q)
         return None
+
+    def _orthogonalised(
+        self, p: Direction, q: Direction, earlier: Sequence[tuple[Direction, Direction, float]]
+    ) -> tuple[Direction, Direction]:
+        """Return a direction p and its image q, changed so that q is orthogonal to earlier images.
+
+        Parameters
+        ----------
+        earlier
+            Earlier directions, their images, and the square of each image.
+        """
+        for earlier_p, earlier_q, earlier_square in earlier:
+            component = self.matrix.inner(earlier_q, q) / earlier_square
+            p = add_scaled(p, -component, earlier_p)
+            q = add_scaled(q, -component, earlier_q)
+        return p, q
 
     def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
         """Return K du by a forward difference of the residual.

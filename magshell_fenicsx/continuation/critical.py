@@ -52,25 +52,30 @@ def critical_boundary(
     null_vector
         Returns the mode that becomes critical at a crossing, from the crossing, the family, and the
         family of the previous boundary.
-    mode, start, sense, ends, steps
-        The first boundary, and the arguments of `Boundary.follow`.
+    mode, start
+        The first boundary, and its first point.
+    sense, ends
+        Sign of dp at the start, and the range of p: its least and largest value.
+    steps
+        No step changes p by more than its scale over this number.
 
     Raises
     ------
     BoundaryLost, NoSystem
-        If `Boundary.follow` raises it; there is no system where another mode is taken up; or other
-        modes are unstable first, and none of them is found.
+        If a boundary cannot be followed, there is no system at the point where another boundary
+        begins, or other modes are unstable first and none of them is found.
     """
     search = _FirstModeSearch(curve, null_vector, ends)
     # the family of the previous boundary, where this one begins at their crossing
     begun_by: int | None = None
     while True:
+        # successor: the boundary that takes over; None as long as this one goes on
         last_point, successor = start, None
         for label, point in mode.follow(start, sense, ends, steps):
-            # the crossing at which this boundary began is found again
+            # the crossing at which this boundary began is found again: it is left out
             if last_point is start and label == "crossing" and point.met == begun_by:
                 continue
-            # other modes are unstable without a crossing that was located
+            # other modes have become unstable, though no crossing was located
             is_point = label in ("point", "end")
             if not last_point.unstable and is_point and _unstable_families(mode, point):
                 successor, sense = search.overtaking_mode(mode, point), point.p - last_point.p
@@ -78,11 +83,13 @@ def critical_boundary(
                 if label == "end":
                     return
                 break
-            # where others are unstable already, no crossing changes which mode is the first
+            # no change of the first mode: at any other event, and at crossings behind which other
+            # modes were unstable already
             if label != "crossing" or last_point.unstable:
                 yield label, point, mode
                 last_point = point
                 continue
+            # a crossing: the other mode becomes critical first beyond it
             sense = point.p - last_point.p
             try:
                 successor = search.mode_beyond(mode, point, sense)
@@ -184,7 +191,10 @@ class _FirstModeSearch:
         """
 
         def starts_of(family: int) -> Iterator[_Successor]:
-            """Yield where a family's boundary may begin: at the crossing, or beyond it."""
+            """Yield the boundary of a family with each point at which it may begin.
+
+            That is the crossing, if the equations do not couple, then a point beyond it.
+            """
             boundary, phi = self._boundary_of(family, crossing, mode.m)
             if mode.m and family not in (0, mode.m):  # the two equations do not couple
                 start = boundary.start(crossing.p, crossing.state, phi)
@@ -232,10 +242,10 @@ class _FirstModeSearch:
         mode: Boundary,
         point: BoundaryPoint,
     ) -> _Successor:
-        """Return a first point at which the mode of one of some families is the first.
+        """Return the first boundary, among those of some families, whose mode is the first.
 
-        This is so if no other mode is unstable there. Families of other modes that are unstable at
-        such a point become candidates, too.
+        A mode is the first if no other mode is unstable at the point where its boundary begins.
+        Families of modes that are unstable there become candidates, too.
 
         Parameters
         ----------
@@ -252,7 +262,7 @@ class _FirstModeSearch:
             If no mode is the first.
         """
         candidates, reason = [*families], "none that comes before it is the first there"
-        for family in candidates:  # which grows
+        for family in candidates:  # the list grows in the loop
             try:
                 for successor in starts_of(family):
                     if not successor.start.unstable:

@@ -18,7 +18,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.control import BorderedMatrix, ConstraintRow, Metric, add_scaled
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import Direction, State, Vector
 
 POWER, SHIFT = 2.0, 1.0  # p and sigma
 MAX_ITERATIONS = 40
@@ -74,6 +74,60 @@ class Deflation:
         return 1 / divisor if divisor else np.inf
 
 
+@dataclass(frozen=True)
+class _DeflatedStep:
+    """Newton's step with deflation at an iterate.
+
+    Attributes
+    ----------
+    matrix
+        The bordered matrix at the iterate.
+    u
+        Displacement of the iterate.
+    newton_step
+        Newton's step (du, dmu) without deflation, d.
+    tau, M
+        The factor that deflation gives the step, and the value of M at the iterate.
+    """
+
+    deflation: Deflation
+    matrix: BorderedMatrix
+    u: Vector
+    newton_step: Direction
+    tau: float
+    M: float
+
+    def nonlinearity(
+        self, trial_u: Vector, residual: tuple[Vector, float], fraction: float
+    ) -> float:
+        """Return which part of a step the linear model of M R leaves unexplained. Collective.
+
+        Parameters
+        ----------
+        trial_u, residual
+            The displacement after the step, and the residuals of equilibrium and row there.
+        fraction
+            The fraction of the deflated step tau d that was taken.
+        """
+        matrix, deflation = self.matrix, self.deflation
+        next_step = matrix.solve(-residual[0], -residual[1])
+        # the next step with the same matrix, over M
+        next_step = add_scaled(
+            next_step, self.tau * deflation.slope(self.u, next_step[0]), self.newton_step
+        )
+        ratio = deflation.value(trial_u) / self.M
+        # the linear model leaves (1 - fraction) of the step: the difference from that, as
+        # displacement and amplitude
+        unexplained = (
+            ratio * next_step[0] + (fraction - 1) * self.tau * self.newton_step[0],
+            ratio * next_step[1] + (fraction - 1) * self.tau * self.newton_step[1],
+        )
+        relative_square = matrix.inner(unexplained, unexplained) / matrix.inner(
+            self.newton_step, self.newton_step
+        )
+        return float(np.sqrt(relative_square) / abs(fraction * self.tau))
+
+
 def find_deflated(
     newton: BorderedNewton,
     guess: State,
@@ -102,6 +156,7 @@ def find_deflated(
     -------
     The state; None if none is found.
     """
+    # fraction: of the deflated step that is taken; leaps: their number so far
     system, state, fraction, leaps = newton.system, guess, 1.0, 0
     deflation = Deflation(Metric(system, 1.0), known_solutions)  # no amplitude is compared
     residual = system.residual(state.u, state.mu), row.residual(state)
@@ -110,9 +165,12 @@ def find_deflated(
         newton_step = matrix.solve(-residual[0], -residual[1])
         tau = deflation.factor(state.u, newton_step[0])
         size = matrix.size(newton_step)
-        M = deflation.value(state.u)
+        step = _DeflatedStep(
+            deflation, matrix, state.u, newton_step, tau=tau, M=deflation.value(state.u)
+        )
         if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
             return None
+        # close to a solution the deflation changes little: the undeflated step is the last one
         if size <= FINAL_STEP and 1 / MAX_DEFLATION_FACTOR < tau < MAX_DEFLATION_FACTOR:
             return state.with_(state.u + newton_step[0], name, state.mu[name] + newton_step[1])
         # the step is shortened until the linear model explains enough of its residual
@@ -129,27 +187,20 @@ def find_deflated(
                 state.u + factor * newton_step[0], name, state.mu[name] + factor * newton_step[1]
             )
             residual = system.residual(trial.u, trial.mu), row.residual(trial)
-            next_step = matrix.solve(-residual[0], -residual[1])
-            # the next step with the same matrix, over M
-            next_step = add_scaled(
-                next_step, tau * deflation.slope(state.u, next_step[0]), newton_step
-            )
-            ratio = deflation.value(trial.u) / M
-            # what the linear model of M R leaves of the step, as displacement and amplitude
-            unexplained = (
-                ratio * next_step[0] + (fraction - 1) * tau * newton_step[0],
-                ratio * next_step[1] + (fraction - 1) * tau * newton_step[1],
-            )
-            relative_square = matrix.inner(unexplained, unexplained) / matrix.inner(
-                newton_step, newton_step
-            )
-            nonlinearity = np.sqrt(relative_square) / abs(factor)
+            nonlinearity = step.nonlinearity(trial.u, residual, fraction)
             if leap:
                 break
             if not nonlinearity <= MAX_NONLINEARITY:
-                shorter = 0.1
-                if np.isfinite(nonlinearity):
-                    shorter = float(np.clip(0.8 * MAX_NONLINEARITY / nonlinearity, 0.1, 0.5))
-                fraction *= shorter
+                fraction *= _shortening(nonlinearity)
         fraction, state = min(fraction, 1.0), trial
     return None
+
+
+def _shortening(nonlinearity: float) -> float:
+    """Return the factor, 0.1 to 0.5, of a step that left too large a part unexplained.
+
+    The unexplained part `nonlinearity` grows with the length of the step.
+    """
+    if not np.isfinite(nonlinearity):
+        return 0.1
+    return float(np.clip(0.8 * MAX_NONLINEARITY / nonlinearity, 0.1, 0.5))

@@ -66,8 +66,9 @@ class Device:
     names
         The amplitudes that are unknown.
 
-    Private fields, both in the order of `names`: `_conjugates` are functions or names of further
-    amplitudes, `_units` the amplitudes per unit of y.
+    Private fields, both in the order of `names`: `_conjugates` are functions of the amplitude that
+    return q and dq/dmu, or names of further amplitudes, whose value is q; `_units` are the changes
+    of the amplitudes per unit of y. `_system` is the inner system.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Device:
         """Return the same device on another system."""
         device = copy(self)
         device._system = system
+        # the unknowns on this rank: those of the system, and the device's own
         device.size = system.size + self.size - self._system.size
         return device
 
@@ -113,11 +115,12 @@ class Device:
 
     def displacement(self, x: Vector) -> Vector:
         """Return the part u of a vector (u, y) of the device's unknowns."""
-        return split(x, len(self.names), self.comm)[0]
+        u, _ = split(x, len(self.names), self.comm)
+        return u
 
     def rates(self, x: Vector) -> dict[str, float]:
         """Return the changes of the unknown amplitudes by name along a vector (u, y)."""
-        y = split(x, len(self.names), self.comm)[1]
+        _, y = split(x, len(self.names), self.comm)
         return dict(zip(self.names, (float(v) for v in y * self._units), strict=True))
 
     def gradient(self, by_u: Vector, by_amplitude: Amplitudes) -> Vector:
@@ -134,7 +137,7 @@ class Device:
         return join(by_u, by_y, self.comm)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        """Return R of the inner system, followed by `rows`."""
+        """Return R of the inner system, followed by the residuals dPi/dmu + q of the device."""
         v, amplitudes = self._split(u, mu)
         rows = self.rows(v, amplitudes)
         return join(self._system.residual(v, amplitudes), rows, self.comm)
@@ -151,7 +154,7 @@ class Device:
         -------
         (k,) numbers, as derivatives by y.
         """
-        # a function returns q and its slope
+        # q of each unknown amplitude; a function returns q, then its slope
         held_values = [
             mu[conjugate] if isinstance(conjugate, str) else conjugate(mu[name])[0]
             for name, conjugate in zip(self.names, self._conjugates, strict=True)
@@ -167,8 +170,10 @@ class Device:
         """
         v, amplitudes = self._split(u, mu)
         if name in self._conjugates:
+            # the rows of the free amplitudes whose conjugate has the value of this amplitude
             is_held_by_name = np.array(self._conjugates, dtype=object) == name
             return join(0.0 * v, self._units * is_held_by_name, self.comm)
+        # R_mu, then the changes of the rows: the second derivatives of Pi
         mixed = [self._system.curvature(v, amplitudes, free_name, name) for free_name in self.names]
         load = self._system.load(v, amplitudes, name)
         return join(load, np.array(mixed) * self._units, self.comm)
@@ -196,6 +201,7 @@ class Device:
         """Assemble the tangent of the inner system, bordered by the unknown amplitudes."""
         v, amplitudes = self._split(u, mu)
         columns, D = self.border(v, amplitudes)
+        # without the unknowns y of the device
         inner_stress = [
             (weight, self.displacement(displacement)) for weight, displacement in stress
         ]
@@ -226,7 +232,10 @@ class Device:
 
     @property
     def multipliers(self) -> int:
-        """The number of amplitudes that are Lagrange multipliers, see `BorderedTangent`."""
+        """The number of unknown amplitudes that multiply their term, as Lagrange multipliers do.
+
+        All are multipliers but those that are positions.
+        """
         return sum(name not in self.coordinates for name in self.names)
 
     def values(self, y: Array) -> dict[str, float]:
@@ -276,6 +285,8 @@ class ParametrisedSystem:
         Amplitude of the inner system -> function that returns f_i with its first two derivatives.
     begin
         The value of t at the states that `contract` gets.
+
+    The private fields have the names of the parameters.
     """
 
     def __init__(
@@ -303,6 +314,7 @@ class ParametrisedSystem:
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         """Return d2Pi/du dt by the chain rule, or the load vector of another amplitude."""
+        # all amplitudes of the inner system, and dmu_i/dt of those that change
         amplitudes, rates = self._expanded(mu), self._rates(mu, name)
         columns = [rate * self._system.load(u, amplitudes, i) for i, rate in rates.items()]
         return sum(columns[1:], columns[0])
@@ -322,7 +334,7 @@ class ParametrisedSystem:
             for i, rate in rates.items()
             for j, other_rate in other_rates.items()
         )
-        # d2mu_i/dt2, by t alone
+        # d2mu_i/dt2, if both amplitudes are t: the third result of a curve
         second_derivatives = dict[str, float]()
         if name == other == self._name:
             second_derivatives = {i: f(t)[2] for i, f in self._curves.items()}
@@ -339,6 +351,7 @@ class ParametrisedSystem:
     def _expanded(self, mu: Amplitudes) -> dict[str, float]:
         """Return the amplitudes of the inner system, from those with t."""
         others = {name: value for name, value in mu.items() if name != self._name}
+        # a curve returns mu_i, then its two derivatives
         return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
 
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
@@ -349,6 +362,7 @@ class ParametrisedSystem:
         """
         if name != self._name:
             return {name: 1.0}
+        # a curve returns mu_i, then dmu_i/dt
         return {i: f(mu[self._name])[1] for i, f in self._curves.items()}
 
 

@@ -83,25 +83,29 @@ class Factorisation:
         of its lagged part, that could not change a sign. Else infinite.
     inertia_is_known
         Whether the negative pivots of the latest tangent, and their uncertainty, are known.
+
+    Private fields: of `_cholmod` and `_mumps` one is in use, as `_pc`. `_border`, `_correction` and
+    `_correction_solver` belong to the latest tangent, if it is bordered or corrected: the
+    elimination of the border, D, and the solver with D. `_bordered` and `_corrected` are that
+    tangent. `_products` are the stored products with D. `_full_factorisations_left` counts down the
+    factorisations of all entries after a failure. `_has_cholmod` and `_tries_cholmod` tell whether
+    CHOLMOD can be used and is tried next. `_definite_count` counts successive matrices of MUMPS
+    without a negative pivot, `_entries` the entries of its matrix. `_rhs` and `_solution` are
+    vectors of PETSc.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
-        """Begin without factors; CHOLMOD is tried first where it can be used.
-
-        Of `_cholmod` and `_mumps` one is in use, as `_pc`. `_border`, `_correction` and
-        `_correction_solver` belong to the latest tangent, if it is bordered or corrected;
-        `_products` are the stored products with its D.
-        """
+        """Begin without factors; CHOLMOD is tried first where it can be used."""
         self.count, self.negative_pivots = 0, 0
         self.stopwatch, self.solving = Stopwatch(), Stopwatch()
         self.comm = comm
         self._cholmod: _CholmodFactors | None = None
         self._mumps: PETSc.PC | None = None
-        self._entries = 0.0  # number of entries of its matrix
+        self._entries = 0.0
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
         self._tries_cholmod = self._has_cholmod = comm.size == 1 and has_cholmod()
-        self._definite_count = 0  # successive matrices of MUMPS without a negative pivot
+        self._definite_count = 0
         self._border: BlockElimination | None = None
         self._bordered: BorderedTangent | None = None
         self.skewed = False
@@ -129,11 +133,12 @@ class Factorisation:
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other
             than the matrix.
         """
+        # the tangent without its border: K, K + N or K + D
         inner = tangent.K if isinstance(tangent, BorderedTangent) else tangent
         self.skewed = isinstance(inner, SkewedTangent)
         with self.stopwatch:
             self._border = self._correction = self._correction_solver = None
-            # a border adds to the count of its K, which must be known then
+            # a border adds to the count of negative pivots of its K, which must be known first
             needs_inertia = needs_inertia or inner is not tangent
             is_factored = isinstance(inner, CorrectedTangent) and self._factor_sparse_part(
                 inner, needs_inertia=needs_inertia
@@ -164,8 +169,9 @@ class Factorisation:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows of the matrix last factored: on this rank, and on all."""
+        """Rows of the matrix last factored, with its border: on this rank, and on all."""
         k = self._border.count if self._border else 0  # further unknowns, on the last rank
+        # PETSc's sizes are (rows, columns)
         local_rows, rows = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
         return local_rows + k * (self.comm.rank == self.comm.size - 1), rows + k
 
@@ -204,8 +210,10 @@ class Factorisation:
         if self._full_factorisations_left > 0:
             return False
         self._factor_symmetric(tangent.K)
+        # stored products are kept if D is a multiple of the earlier one
         self._products = (self._products or ProductCache(tangent.D)).cache_for(tangent.D)
         self._correction, self._corrected, self.inertia_is_known = tangent.D, tangent, False
+        # the count fails where D is not small
         return not needs_inertia or self.count_corrected_inertia()
 
     def count_corrected_inertia(self) -> bool:
@@ -222,6 +230,7 @@ class Factorisation:
         tangent, products = self._corrected, self._products
         if not tangent or not products:  # an earlier count failed
             return False
+        # K^-1 times random numbers, the same in each run
         random = np.random.default_rng(self.comm.rank)
         start_vector = self._solve_sparse(random.standard_normal(tangent.K.getLocalSize()[0]))
         crossings = count_crossings(products.times, self._solve_sparse, start_vector, self.comm)
@@ -229,6 +238,7 @@ class Factorisation:
             self._full_factorisations_left = FULL_FACTORISATIONS_AFTER_FAILURE
             self._products = self._correction = None
             return False
+        # the same count, with the uncertainty that a lagged part of D adds
         crossings = crossings_with_lag(
             tangent, crossings, self._solve_sparse, self._sparse_product, start_vector, self.comm
         )
@@ -239,8 +249,10 @@ class Factorisation:
     def missing_product(self, x: Vector) -> Vector:
         """Return x times the difference of the present and the lagged part of the latest tangent.
 
-        The present part is extrapolated. The product is zero if no part is lagged. Collective.
+        The present part is extrapolated from earlier states. The product is zero if no part is
+        lagged. Collective.
         """
+        # entries for the unknowns of a border stay zero
         product, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
         if self._correction and self._corrected:
             product[:rows] = self._corrected.missing_product(x[:rows])
@@ -280,12 +292,12 @@ class Factorisation:
         After some matrices without a negative pivot, CHOLMOD is tried again.
         """
         entries = _entry_count(K)
-        serves = False  # whether the symbolic work does
+        is_analysed = False  # whether the symbolic work of an earlier K serves
         if self._mumps is not None:
             _, factored_matrix = self._mumps.getOperators()
-            serves = factored_matrix.handle == K.handle and self._entries == entries
-        if self._mumps is None or not serves:
-            # of another pattern PETSc makes new factors itself, without the options below
+            is_analysed = factored_matrix.handle == K.handle and self._entries == entries
+        if self._mumps is None or not is_analysed:
+            # for another pattern PETSc would make new factors itself, without the options below
             self._mumps, self._entries = _new_pc(K, "mumps"), entries
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
@@ -311,6 +323,7 @@ class Factorisation:
         If that sign differs from that of det K, the tangent has one unstable direction less than K.
         """
         self.matrix = sum_matrix = tangent.K.copy()
+        # the copy of K counts as symmetric, K + N is not
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
             sum_matrix.setOption(option, False)
         sum_matrix.axpy(1.0, tangent.N, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -321,7 +334,8 @@ class Factorisation:
         F.setMumpsIcntl(14, 50)  # per cent of memory above the estimate
         _renew(pc, sum_matrix)
         is_positive = self.comm.bcast(F.getMumpsRinfog(12) > 0.0 if self.comm.rank == 0 else None)
-        # det K is positive for an even number of negative pivots: here the signs differ
+        # det K is positive for an even number of negative pivots. The signs differ if that number
+        # is odd and det (K + N) positive, or even and not positive
         if self.negative_pivots % 2 == is_positive:
             self.negative_pivots -= 1
 
@@ -380,10 +394,11 @@ class Factorisation:
         return np.array(y.array_r)
 
     def _solve_inner(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
-        """Return K^-1 rhs, or (K + D)^-1 rhs if there is a dense correction. Collective.
+        """Return the inverse of the inner matrix, K, K + N or K + D, times `rhs`. Collective.
 
-        With a correction the solution is an iteration, preconditioned by the factors of K. The
-        result is NaN if K + D is so nearly singular that the factors of K do not serve.
+        With a dense correction D an iteration finds the solution, preconditioned by the factors of
+        K; with `low_accuracy` to a relative residual of `LOOSE_TOLERANCE`. The result is NaN if
+        K + D is so nearly singular that the factors of K do not serve.
         """
         if self._correction is None:
             return self._solve_sparse(rhs)
@@ -452,7 +467,16 @@ def has_cholmod() -> bool:
 class _CholmodFactors:
     """CHOLMOD's factors of a copy of a matrix's upper triangle, on one rank.
 
-    From any other format PETSc itself makes such a copy each time, and leaks it if CHOLMOD fails.
+    The copy has the format that CHOLMOD takes. From any other format PETSc itself would make such a
+    copy each time, and leak it if CHOLMOD fails.
+
+    Attributes
+    ----------
+    pc
+        PETSc's preconditioner with the factors.
+
+    Private fields: `_K` is the matrix, `_upper` the copy, `_entries` their number of entries when
+    the copy was made.
     """
 
     def __init__(self, K: PETSc.Mat) -> None:
@@ -532,6 +556,9 @@ class BlockElimination:
     negative_pivots
         Number that the border adds to that of K (Haynsworth's inertia additivity), without its
         multipliers.
+
+    Private fields: `_C` and `_D` are parts of the matrix, `_X` are the columns of K^-1 C, `_S` is
+    the Schur complement.
     """
 
     def __init__(
@@ -555,7 +582,9 @@ class BlockElimination:
         """Return the bordered matrix times (u, y). Collective."""
         u, y = split(x, self.count, self._comm)
         forces = np.sum([yi * column for yi, column in zip(y, self._C, strict=True)], axis=0)
-        return join(self._times(u) + forces, self._products([u])[0] + self._D @ y, self._comm)
+        K_u = self._times(u)
+        (displacements,) = self._products([u])  # C^T u
+        return join(K_u + forces, displacements + self._D @ y, self._comm)
 
     def solve(self, rhs: Vector) -> Vector:
         """Return (u, y) for a right side, refined once if a nearly singular K loses digits."""
@@ -570,7 +599,8 @@ class BlockElimination:
         """Return (u, y) for a right side (f, g) by S y = g - C^T K^-1 f and K u = f - C y."""
         f, g = split(rhs, self.count, self._comm)
         u = self._solve(f)
-        y = np.linalg.solve(self._S, g - self._products([u])[0])
+        (displacements,) = self._products([u])  # C^T K^-1 f
+        y = np.linalg.solve(self._S, g - displacements)
         change = np.sum([yi * x for yi, x in zip(y, self._X, strict=True)], axis=0)
         return join(u - change, y, self._comm)
 

@@ -10,8 +10,9 @@ augmentation: Govaerts, Numerical methods for bifurcations of dynamical equilibr
 4). A fold is R(u, mu) = 0 and g(u, mu) = 0, solved for (u, mu): an iteration of Newton's method
 takes one factorisation and three back-solves.
 
-R = dPi/du, K = dR/du; mu is the one amplitude (load parameter) that varies, R_mu its load vector. A
-dot is the inner product over all ranks; Pi'''(v, v, .) is a third derivative of the potential as a
+R = dPi/du, K = dR/du; mu is the one amplitude (load parameter) that varies, by `name`, R_mu its
+load vector. `newton` is the solver of a system with its factorisation, which it overwrites. A dot
+is the inner product over all ranks; Pi'''(v, v, .) is a third derivative of the potential as a
 vector. phi is the null vector. Lengths are displacements in units of the system's length. `stress`
 are weighted displacements: K takes the sum of their stresses in place of the stress of u, since
 small errors of a guess u change its own stress much. A holding force along b, of unknown size,
@@ -85,14 +86,15 @@ def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
     K = symmetric_part(tangent)
     magnitudes = np.abs(mode[: K.getLocalSize()[0]])  # without the entries of a border
     first_row = K.getOwnershipRange()[0]
-    # the rank that owns the largest entry, and there the row of that; elsewhere no row
+    # the rank that owns the largest entry; e has its one on that rank alone
     _, owner = comm.allreduce((float(magnitudes.max(initial=0.0)), comm.rank), MPI.MAXLOC)
     e = np.zeros_like(mode)
     if comm.rank == owner:
         e[int(np.argmax(magnitudes))] = 1.0
+    # the row of that entry in the global matrix; on the other ranks there is none
     rows = [first_row + int(i) for i in np.flatnonzero(e)]
     diagonal = comm.allreduce(sum(K.getValue(i, i) for i in rows))
-    # the sum of spring and diagonal entry is positive; where the entry is zero, K gives the scale
+    # spring and diagonal entry d add up to 2 |d|; where d is zero, the norm of K is the stiffness
     stiffness = 2 * abs(diagonal) - diagonal or K.norm(PETSc.NormType.INFINITY) or 1.0
     for i in rows:
         K.setValue(i, i, stiffness, addv=True)
@@ -123,7 +125,8 @@ class AugmentedTangent:
         Number of unstable directions other than v.
 
     Private fields: `_b` is b with length one, `_e` the spring's e. `_p` and `_q` are (K + s e e)^-1
-    times e and b, `_border` is the 2 x 2 Schur complement of K + s e e.
+    times e and b, `_border` is the 2 x 2 Schur complement of K + s e e, `_factors` are its factors.
+    `_inner` returns the inner product of two vectors over all ranks.
     """
 
     def __init__(
@@ -144,11 +147,15 @@ class AugmentedTangent:
         self._b, self._e, self._inner = b / np.sqrt(inner(b, b)), spring.e, inner
         # the solutions for the spring's e and for b
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
-        q = inner(self._e, self._q)
+        e_dot_q = inner(self._e, self._q)
         # 2 x 2 Schur complement, whose unknowns are the spring's force and the factor of b
         self._border = np.array(
-            [[1 / spring.stiffness - inner(self._e, self._p), q], [q, -inner(self._b, self._q)]]
+            [
+                [1 / spring.stiffness - inner(self._e, self._p), e_dot_q],
+                [e_dot_q, -inner(self._b, self._q)],
+            ]
         )
+        # v and g solve the bordered equations for f = 0 and c = 1
         self.v, self.g = self._solve_bordered(np.zeros_like(b), 1.0)
 
     def solve(self, f: Vector) -> tuple[Vector, float]:
@@ -168,9 +175,10 @@ class AugmentedTangent:
         return y + force * self._p - t * self._q, float(t)
 
     def null_vector_at(self, old: State, new: State) -> Vector:
-        """Return the null vector at a nearby state, by one chord iteration of K v + g b = 0.
+        """Return the null vector at a nearby state, by one iteration of the chord method.
 
-        Differences of the residual replace K times v. Collective.
+        The iteration solves K v + g b = 0, with K of the new state in the equation and the factors
+        of this tangent as matrix. Differences of the residual replace K times v. Collective.
 
         Parameters
         ----------
@@ -191,9 +199,9 @@ def held_along(
 ) -> tuple[State, float] | None:
     """Return the equilibrium in which a force along b holds the guess's component along b.
 
-    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where
-    contact forces begin within a step and full steps fail, it is solved between soft faces first,
-    as `BorderedNewton.solve` does. Collective.
+    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Full steps
+    of Newton's method may fail where contact forces begin within a step. Then the problem is solved
+    first by `BorderedNewton.solve`, between faces that are soft and become harder. Collective.
 
     Parameters
     ----------
@@ -214,9 +222,10 @@ def held_along(
         If the tangent is singular in another direction too.
     """
     equilibrium = _held_by_full_steps(newton, guess, b, stress)
-    if equilibrium or not newton.options.has_onsets:
+    if equilibrium or not newton.options.has_onsets:  # no contact forces can begin
         return equilibrium
-    # the force is the unknown amplitude, and b . u its conjugate, which is prescribed
+    # a system in which the force along b is the unknown amplitude; its conjugate, -b . u, is
+    # prescribed to be that of the guess
     system = HoldingForceSystem(newton.system, b)
     row = PrescribedConjugate(system, FORCE, -dot(system.comm, b, guess.u))
     start = State(guess.u, {**guess.mu, FORCE: 0.0})
@@ -229,10 +238,11 @@ def held_along(
 def _held_by_full_steps(
     newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[WeightedDisplacement] = ()
 ) -> tuple[State, float] | None:
-    """Return the equilibrium held along b, as `held_along` does, by full steps alone.
+    """Return the equilibrium near a guess with the guess's component along b, by full steps alone.
 
-    One augmented tangent serves several steps. It is renewed when the steps do not shrink enough.
-    A tangent is the iterate's own (`is_own`) if it was computed there.
+    A force along b, of unknown size, keeps that component. One augmented tangent serves several
+    steps. It is renewed when the steps do not shrink enough. A tangent is the iterate's own
+    (`is_own`) if it was computed there.
 
     Returns
     -------
@@ -385,7 +395,8 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last_state, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
     load = system.load(state.u, state.mu, name)
-    # the tangent belongs to the state before the last step
+    # the tangent belongs to the state before the last step; its null vector is corrected, and given
+    # the sense in which the conjugate displacement grows
     phi = _oriented(system, tangent.null_vector_at(last_state, state), load)
     work = dot(system.comm, phi, system.load(state.u, state.mu, name))
     cubic = third_derivative(system, state, phi)
@@ -426,7 +437,7 @@ def predict_fold(
 ) -> FoldGuess:
     """Extrapolate the folds at other values of a parameter to its value `p`. Collective.
 
-    The polynomials through the last one, two and three folds are compared, and the one with the
+    The polynomials through the last one, two and three folds each give a guess. The one with the
     least residual is used: for long or uneven steps a quadratic may be worse than no extrapolation.
 
     Parameters
@@ -492,8 +503,10 @@ def _newton_step(
         The augmented tangent at the state.
     """
     comm, u, v = system.comm, state.u, tangent.v
+    # responses w orthogonal to b; t b are the parts that K cannot balance
     w_R, t_R = tangent.solve(system.residual(u, state.mu))
     w_mu, t_mu = tangent.solve(system.load(u, state.mu, name))
+    # Pi'''(v, v, .), then (dK/dmu) v as the derivative of R_mu along v
     cubic = third_derivative(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     # the derivative of g along (du, dmu) = (-w_mu, 1)
@@ -520,7 +533,7 @@ def _oriented(system: System, v: Vector, load: Vector) -> Vector:
 def _remaining_error(sizes: Sequence[float]) -> float:
     """Return the error after the last step, if sizes shrink like a geometric series or faster.
 
-    It is zero for steps at the level of rounding, and infinite if the sizes grow.
+    It is zero if the last steps are at the level of rounding, and infinite if the sizes grow.
 
     Parameters
     ----------
@@ -542,11 +555,15 @@ def _lagrange_weight(values: Sequence[float], i: int, p: float) -> float:
 def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> FoldGuess | None:
     """Predict the next fold in the amplitude `name`, for growing magnitude. Collective.
 
-    Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu
-    varied by m, equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi
-    . R_mu = lambda phi . du/dmu. The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other
-    modes follow mu linearly. The null vector of the guess points the way that the path goes. The
-    prediction takes one factorisation.
+    The prediction is made at `point`, a point of a path. phi is the softest mode, of length one,
+    with K phi = lambda phi. The state moves by a phi while mu changes by m. Equilibrium along phi
+    is then
+
+        lambda a + c a^2/2 = b m,  c = Pi'''(phi, phi, phi),  b = -phi . R_mu = lambda phi . du/dmu
+
+    The fold is at a = -lambda/c, m = -lambda^2/(2 b c). All other modes follow mu linearly. The
+    null vector of the guess points the way that the path goes. The prediction takes one
+    factorisation.
 
     Returns
     -------
@@ -565,6 +582,7 @@ def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> FoldGuess | N
     work = mode.eigenvalue * rate_along_phi  # b
     if mode.eigenvalue <= 0 or not cubic * work:
         return None
+    # m, then the displacement at the fold: other modes by the rate, phi by a = -lambda/c
     dmu = -(mode.eigenvalue**2) / (2 * cubic * work)
     if not 0 < dmu / mu < MAX_DISTANCE_TO_FOLD:
         return None

@@ -39,7 +39,11 @@ def interpolated(x: Sequence[float], y: Sequence[float], place: float) -> float:
 
 
 def _stationary_places(rise: float, d0: float, d1: float) -> list[float]:
-    """Return all places where a cubic is stationary; for the parameters see `stationary`."""
+    """Return all places where a cubic is stationary.
+
+    The cubic rises by `rise` from 0 to 1, and has the slopes d0 at 0 and d1 at 1.
+    """
+    # coefficients of its derivative, a quadratic polynomial
     roots = np.roots([3 * (d0 + d1 - 2 * rise), 2 * (3 * rise - 2 * d0 - d1), d0])
     return [float(r.real) for r in roots if abs(r.imag) < REAL_ROOT_TOLERANCE]
 
@@ -54,7 +58,7 @@ def stationary(rise: float, d0: float, d1: float) -> float:
     d0, d1
         Its slopes at 0 and 1, of opposite signs.
     """
-    # without a place between the ends: the zero of a slope that is linear
+    # if no stationary place lies between the ends: the zero of a linear slope from d0 to d1
     inner_places = [t for t in _stationary_places(rise, d0, d1) if 0 < t < 1]
     t = inner_places[0] if inner_places else d0 / (d0 - d1)
     return float(min(max(t, MIN_END_DISTANCE), 1 - MIN_END_DISTANCE))

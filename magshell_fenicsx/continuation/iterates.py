@@ -57,7 +57,8 @@ class NewtonStep:
     Attributes
     ----------
     size
-        Size of the step in lengths of the system, see `BorderedMatrix.size`.
+        Size of the step in lengths of the system: the larger one of its displacement and of its
+        change of the amplitude.
     is_own
         Whether the matrix was computed at this iterate.
     pivots
@@ -106,12 +107,12 @@ class Iterates:
     def extrapolated_error(self) -> float:
         """The error after the last step, extrapolated from the last two ratios.
 
-        Bending may converge at once and hide stretching, which converges slowly: so one small ratio
-        is not enough.
+        One small ratio is not enough: bending may converge at once and hide that stretching
+        converges slowly.
         """
         if self.kinks or self.searched:
             return np.inf
-        return extrapolated_error([step.size for step in self.steps], 2)
+        return extrapolated_error([step.size for step in self.steps], ratios=2)
 
     @property
     def error(self) -> float:
@@ -137,6 +138,7 @@ class Iterates:
         tolerance = max(tolerance, self.relative_tolerance * self.steps[0].size)
         if not step.size <= self.largest:
             return "far" if self.stops_early else "diverged"
+        # the step is small, or the error after it is extrapolated to be small
         longest = max(step.size for step in self.steps)
         self.allowed = EXTRAPOLATED_TOLERANCE * tolerance * min(1.0, longest)
         if step.size <= tolerance or self.extrapolated_error <= self.allowed:
@@ -144,6 +146,7 @@ class Iterates:
         # only steps with a new matrix show that the solve does not converge
         if not step.is_own:
             return "go on"
+        # the earlier steps with a matrix of their own
         earlier_own = [s for s in earlier if s.is_own]
         if self.stops_early and self._leads_astray(earlier_own, step):
             return "far"
@@ -172,8 +175,9 @@ class Iterates:
             The last step, with its own matrix.
         """
         if len(earlier) == 1 and step.pivots != earlier[0].pivots:
-            # with more unstable directions than before it is past an instability, which a shorter
-            # step of the path meets too; then the step must shrink, not only stay bounded
+            # the iterate has other unstable directions than the first one. If they are more, it is
+            # past an instability, and its step must shrink; if they are fewer, its step must only
+            # stay bounded
             is_past = step.pivots > earlier[0].pivots
             allowed_ratio = QUADRATIC_RATIO if is_past else DIVERGENCE_RATIO
             return step.size > allowed_ratio * earlier[0].size

@@ -69,6 +69,7 @@ class ArnoldiBasis:
 
         The vector is zero if the space is invariant.
         """
+        # the image of the last vector gives column j of H
         j, new_vector = len(self.basis) - 1, np.array(self._times(self.basis[-1]))
         # Gram-Schmidt, twice for what rounding has left
         for _ in range(2):
@@ -136,6 +137,9 @@ class CorrectionSolver:
         D with earlier products.
     size
         Number of unknowns on this rank.
+
+    Private fields: the first `_count` columns of `_U` and `_C` are in use. Those of C are
+    orthonormal, and each is I + A times the same column of U.
     """
 
     def __init__(
@@ -148,14 +152,13 @@ class CorrectionSolver:
     ) -> None:
         """Orthonormalise the earlier products, with which each solution begins. Collective."""
         self._solve_sparse, self._products, self._comm = solve_sparse, products, comm
-        # columns u of U, and c = (I + A) u of C, which are orthonormal; `_count` are in use
         shape = (size, MAX_STORED_PRODUCTS + MAX_PRODUCTS)
         self._U, self._C = (np.empty(shape, order="F") for _ in range(2))
         self._count = 0
         if products.pairs:
             U, DU = (np.column_stack(vectors) for vectors in zip(*products.pairs, strict=True))
             C = U + solve_columns(DU)
-            for _ in range(2):
+            for _ in range(2):  # the second time for what rounding has left
                 # orthonormal columns C from the eigenvectors of C^T C; dependent ones are left out
                 squares, Q = np.linalg.eigh(comm.allreduce(C.T @ C))
                 independent = squares > DEPENDENCE_TOLERANCE * squares[-1]
@@ -179,15 +182,15 @@ class CorrectionSolver:
         norm_of_b = np.sqrt(dot(self._comm, b, b))
         if not 0.0 < norm_of_b < np.inf:
             return b
-        # the best combination of earlier vectors, and what it leaves of b
-        x, remainder = self._project_out(np.zeros_like(b), np.array(b), -1.0)
+        # x: the best combination of the columns of U; remainder: b - (I + A) x
+        x, remainder = self._project_out(np.zeros_like(b), np.array(b), sign=-1.0)
         residual = np.sqrt(dot(self._comm, remainder, remainder)) / norm_of_b
         column_count = self._count
         while residual > tolerance and column_count < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
             # the remainder as new direction, and its image by I + A: both become new columns, with
             # the image orthogonal to all earlier ones
             image = remainder + self._solve_sparse(self._products.times(remainder))
-            u, c = self._project_out(remainder, image, 1.0, column_count)
+            u, c = self._project_out(remainder, image, sign=1.0, count=column_count)
             norm = np.sqrt(dot(self._comm, c, c))
             new_u, new_c = self._U[:, column_count], self._C[:, column_count]
             new_u[:], new_c[:] = u / norm, c / norm
@@ -202,7 +205,7 @@ class CorrectionSolver:
         self._count = min(column_count, MAX_STORED_PRODUCTS)
         if not residual <= max(ACCEPTED_TOLERANCE, tolerance):
             return np.full_like(b, np.nan)
-        # (I + A) x = remainder has nearly the solution x = remainder, where A is small
+        # the error e of x solves (I + A) e = remainder. A is small there: e is about the remainder
         return x + remainder if residual <= tolerance else x
 
     def _project_out(
@@ -258,6 +261,15 @@ class ConjugateComplement:
     ----------
     X, KX
         Vectors, which may be none, and K times each.
+
+    Attributes
+    ----------
+    X, KX
+        The same as columns; not set without vectors.
+    M
+        X^T K X, a small matrix.
+
+    The private field `_is_proper` tells whether there are vectors X.
     """
 
     def __init__(self, X: Sequence[Vector], KX: Sequence[Vector], comm: MPI.Comm) -> None:
@@ -290,6 +302,9 @@ class SymmetricUpdate:
         Vectors, and K times each.
     missing
         Y, the products of what D lacks with X.
+
+    Private fields: `_complement` has X, KX and X^T K X, `_Y` the columns of Y, and `_XY` is the
+    symmetric part of X^T Y.
     """
 
     def __init__(
@@ -308,7 +323,9 @@ class SymmetricUpdate:
 
     def times(self, v: Vector) -> Vector:
         """Return (D + F) v. Collective."""
+        # c = C v, y = Y^T v
         c, y = self._complement.components(v), self._comm.allreduce(self._Y.T @ v)
+        # C^T (Y^T v - X^T Y C v) is K X times this
         transposed = np.linalg.solve(self._complement.M.T, y - self._XY @ c)
         return np.asarray(self._D.times(v) + self._Y @ c + self._complement.KX @ transposed)
 
@@ -336,11 +353,13 @@ def count_crossings(
     added, uncertainty, found_vectors = 0, 0.0, list[Vector]()
 
     def orthogonal_to_found(v: Vector) -> Vector:
+        """Return v without its components along the vectors found before."""
         for q in found_vectors:
             v = v - dot(comm, q, v) * q
         return v
 
     def deflated_product(v: Vector) -> Vector:
+        """Return A v without its components along the vectors found before."""
         return orthogonal_to_found(solve_sparse(D(v)))
 
     # a run finds one vector of each multiple eigenvalue
@@ -349,13 +368,13 @@ def count_crossings(
         eigenpairs = _converged_eigenpairs(krylov)
         if eigenpairs is None:
             return None
-        values, vectors = eigenpairs
+        values, vectors = eigenpairs  # vectors by their coefficients in the Krylov basis
         uncertainty = max(uncertainty, float((np.abs(values) / np.abs(1 + values)).max()))
         large_indices = np.flatnonzero(np.abs(values) > SMALL_EIGENVALUE)
         if not len(large_indices):
             return EigenvalueCrossings(added, uncertainty, found_vectors)
         for i in large_indices[values[large_indices].imag >= 0]:  # of a conjugate pair one
-            # one real vector, or real and imaginary part of a complex one
+            # coefficients of one real vector, or of the real and imaginary part of a complex one
             coefficients = [vectors[:, i].real]
             if values[i].imag > 0:
                 coefficients.append(vectors[:, i].imag)
@@ -373,7 +392,7 @@ def count_crossings(
 
 
 def _converged_eigenpairs(krylov: ArnoldiBasis) -> tuple[Array, Array] | None:
-    """Grow a Krylov space until its large eigenvalues are accurate. Collective.
+    """Grow a Krylov space until the large eigenvalues of its matrix H are accurate. Collective.
 
     Returns
     -------
@@ -427,27 +446,15 @@ def crossings_with_lag(
     lagged = tangent.lagged
     if lagged is None:
         return crossings
-    # smallest: a bound of the ratio along all vectors whose eigenvalues are not large
-    X, smallest = crossings.large_vectors, SMALL_EIGENVALUE / (1 - SMALL_EIGENVALUE)
+    # the ratios along the vectors of large eigenvalues, then the largest one in their complement
+    X = crossings.large_vectors
     KX = [K(x) for x in X]
-    uncertainties = list[float]()
-    for x, y in zip(X, KX, strict=True):
-        lagged_part = dot(comm, x, lagged.times(x))
-        stiffness = dot(comm, x, y) + dot(comm, x, tangent.D.times(x))
-        uncertainties.append(abs(lagged_part / stiffness))
+    uncertainties = _uncertainties_along(X, KX, tangent.D, lagged, comm)
     complement = ConjugateComplement(X, KX, comm)
-    project = complement.project
-
-    def spectral_radius_in_complement(times: LinearMap) -> float:
-        def product(v: Vector) -> Vector:
-            return project(solve_sparse(times(project(v))))
-
-        return spectral_radius(product, project(first), comm)
-
-    in_complement = max(smallest, spectral_radius_in_complement(lagged.times))
-    if tangent.extrapolated_product:  # the lagged part may be small where the present one is not
-        missing = spectral_radius_in_complement(tangent.missing_product)
-        in_complement = max(in_complement, missing / MAX_MISSING_PART)
+    in_complement = _uncertainty_in_complement(
+        tangent, lagged, complement, solve_sparse, first, comm
+    )
+    # where few vectors have a large ratio, D is corrected along them with the present product
     large_indices = [i for i, value in enumerate(uncertainties) if not value <= MAX_UNCERTAINTY]
     present = tangent.present_product
     if (
@@ -459,9 +466,75 @@ def crossings_with_lag(
         missing_products = [present(x) - lagged.times(x) for x in X]
         D = SymmetricUpdate(tangent.D, X, missing_products, KX, comm)
         if corrected := count_crossings(D.times, solve_sparse, first, comm):
+            # along the corrected vectors nothing is uncertain any more
             small_uncertainties = [value for value in uncertainties if value <= MAX_UNCERTAINTY]
             return replace(corrected, uncertainty=max([in_complement, *small_uncertainties]))
     return replace(crossings, uncertainty=max([in_complement, *uncertainties]))
+
+
+def _uncertainties_along(
+    X: Sequence[Vector],
+    KX: Sequence[Vector],
+    D: DenseCorrection,
+    lagged: DenseCorrection,
+    comm: MPI.Comm,
+) -> list[float]:
+    """Return the ratio of x . L x to x . (K + D) x along each vector x. Collective.
+
+    Parameters
+    ----------
+    X, KX
+        The vectors, and K times each.
+    lagged
+        L, the lagged part of D.
+    """
+    uncertainties = list[float]()
+    for x, Kx in zip(X, KX, strict=True):
+        lagged_part = dot(comm, x, lagged.times(x))
+        stiffness = dot(comm, x, Kx) + dot(comm, x, D.times(x))
+        uncertainties.append(abs(lagged_part / stiffness))
+    return uncertainties
+
+
+def _uncertainty_in_complement(
+    tangent: CorrectedTangent,
+    lagged: DenseCorrection,
+    complement: ConjugateComplement,
+    solve_sparse: LinearMap,
+    first: Vector,
+    comm: MPI.Comm,
+) -> float:
+    """Return a bound of the uncertainty from the lagged part, in a K-conjugate complement.
+
+    It is the largest magnitude of an eigenvalue of K^-1 L there. If the present part can be
+    extrapolated, what L lacks of it counts too. Collective.
+
+    Parameters
+    ----------
+    lagged
+        L, the lagged part of D.
+    complement
+        The complement of the vectors of large eigenvalues of K^-1 D.
+    solve_sparse, first
+        K^-1 times a vector, and the start vector of the iterations.
+    """
+    project = complement.project
+
+    def spectral_radius_in_complement(times: LinearMap) -> float:
+        """Return the largest magnitude of an eigenvalue of K^-1 times a map."""
+
+        def product(v: Vector) -> Vector:
+            return project(solve_sparse(times(project(v))))
+
+        return spectral_radius(product, project(first), comm)
+
+    # a bound along all vectors whose eigenvalues of K^-1 D are not large
+    smallest = SMALL_EIGENVALUE / (1 - SMALL_EIGENVALUE)
+    in_complement = max(smallest, spectral_radius_in_complement(lagged.times))
+    if tangent.extrapolated_product:  # the lagged part may be small where the present one is not
+        missing = spectral_radius_in_complement(tangent.missing_product)
+        in_complement = max(in_complement, missing / MAX_MISSING_PART)
+    return in_complement
 
 
 def spectral_radius(times: LinearMap, first: Vector, comm: MPI.Comm) -> float:

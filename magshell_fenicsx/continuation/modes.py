@@ -105,7 +105,8 @@ class _InverseKrylovSpace:
         Largest sum of magnitudes in a row of K.
 
     Private fields: `_V` and `_W` have V and W in their first `_count` rows; `_size` is the number
-    of all unknowns. `_next` is the vector by which the space grows next.
+    of all unknowns. `_next` is the vector by which the space grows next. `_factors` are those of K;
+    they are `skewed` if K is not symmetric.
     """
 
     def __init__(self, factors: Factorisation) -> None:
@@ -148,10 +149,13 @@ class _InverseKrylovSpace:
             theta, Y = _real_pairs(inverse)
         else:
             theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)
-        # the largest theta of either sign, nearest to zero in lambda, is at an end of the list
+        # lambda = 1/theta is nearest to zero for the largest theta of either sign: these are the
+        # first and the last one (the same one in a space of one vector)
         pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
-        if self._count == MAX_VECTORS:  # restart with the vectors of the largest theta
+        # a full space is reduced to the vectors of the largest theta; Y has them in the basis V,
+        # orthonormal
+        if self._count == MAX_VECTORS:
             largest = np.argsort(-np.abs(theta))[:VECTORS_AFTER_RESTART]
             Y = np.linalg.qr(Y[:, largest])[0] if self._factors.skewed else Y[:, largest]
             self._count = Y.shape[1]
@@ -171,8 +175,9 @@ class _InverseKrylovSpace:
         1/lambda, its vector after one more inverse iteration, and the residual K^-1 v - theta v.
         """
         V, W = self._V[: self._count], self._W[: self._count]
-        image = y @ W
-        return theta, image / np.sqrt(dot(self._comm, image, image)), image - theta * (y @ V)
+        image = y @ W  # K^-1 v of the vector v = y V
+        vector = image / np.sqrt(dot(self._comm, image, image))
+        return theta, vector, image - theta * (y @ V)
 
     def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _RitzPair:
         """Return the pair nearest to zero, and choose the next vector of the space.
@@ -292,7 +297,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
     # a positive semidefinite tangent with a kernel would break down at the shift zero
     requested = min(max(count, kernel or slices.count_below(0.0)), slices.finite_count)
     # (a) the eigenvalues nearest to zero, to three digits, give the order of magnitude
-    nearest = slices.nearest_to(-slices.rounding if kernel else 0.0, requested + kernel + 1, 1e-3)
+    around = -slices.rounding if kernel else 0.0
+    nearest = slices.nearest_to(around, requested + kernel + 1, tolerance=1e-3)
     shift = -2 * max(abs(mode.eigenvalue) for mode in nearest)
     # (b) a shift with nothing below it
     trials = 0
@@ -300,7 +306,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
         if (trials := trials + 1) == MAX_TRIALS:
             raise ModesNotFound(f"the tangent has eigenvalues below {shift:g}")
         shift *= 4
-    # (c) the eigenvalues above it; again with more if some below the last one were missed
+    # (c) the eigenvalues above the shift. The inertia counts all below the last one that was found;
+    # if Lanczos has missed some of them, it computes as many more
     computed = requested
     for _ in range(MAX_TRIALS):
         modes = slices.nearest_to(shift, computed, LANCZOS_TOLERANCE)
@@ -340,6 +347,9 @@ class _SpectrumSlices:
     ----------
     finite_count
         Number of finite eigenvalues: of unknowns with mass.
+
+    Private fields: `_shifted` is the matrix K - sigma M for the latest sigma, `_sigma`, and
+    `_factorisation` has its factors.
     """
 
     def __init__(self, K: PETSc.Mat, M: PETSc.Mat) -> None:

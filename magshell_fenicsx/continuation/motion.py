@@ -175,7 +175,9 @@ class AveragedContact(Protocol):
 
 
 class MovingSupports(Protocol):
-    """Supports that move in time; see `shells.mass`.
+    """Supports that move in time as amplitudes prescribe.
+
+    A time with `before_kink` is taken just before a kink or jump of the motion, else just after it.
 
     Attributes
     ----------
@@ -223,12 +225,14 @@ def consistent_state(
     -------
     Displacement, velocity and all amplitudes.
     """
+    # each amplitude is of one of two kinds: `is_spring` where g depends on the amplitude itself,
+    # else g constrains u
     y, comm = device.unknowns(mu), system.comm
     for _ in range(MAX_ITERATIONS):
         amplitudes = {**mu, **device.values(y)}
         C, D = device.border(u, amplitudes)
         X, is_spring = [inverse_mass(c) for c in C], np.diag(D) != 0
-        # amplitudes with a spring are unknowns themselves; the others constrain u along X
+        # derivatives of g: by y for springs, for constraints by a displacement along X
         S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
         correction = np.linalg.solve(S, device.rows(u, amplitudes))
         # y changes by the springs, u by the constraints

@@ -8,10 +8,12 @@ the corrector of a path, and computes the path's tangent at a solution.
 
 mu is the one amplitude (load parameter) that varies; the others are fixed. A row is the scalar
 equation g = 0: a prescribed load, conjugate displacement (on which mu does work) or arc length.
-`stress` are weighted displacements: K takes the sum of their stresses in place of the stress of u,
-since small errors of a guess u change its own stress much. Lengths are displacements in units of
-the system's length. Negative pivots of K count unstable directions. Forces of terms that couple all
-unknowns are extrapolated from earlier states where they are small.
+The argument `stress` is a list of displacements with weights: K takes the weighted sum of their
+stresses in place of the stress of u, since small errors of a guess u change its own stress much.
+Lengths are displacements in units of the system's length. Negative pivots of K count unstable
+directions. Forces of terms that couple all unknowns are extrapolated from earlier states where they
+are small; `_tangent.lagged` tells whether the part of K that belongs to them is of an earlier
+state.
 """
 
 from collections.abc import Sequence
@@ -111,7 +113,7 @@ class BorderedNewton:
 
     Private fields: `_full_steps` and `_line_search` are two SNES, the second only where forces
     begin within a step. `_callbacks` are what both call, `_x` is their vector (u, mu), `_tangent`
-    the latest tangent with its state.
+    the latest tangent with its state, `_work` the count of iterations, which several solvers share.
     """
 
     def __init__(
@@ -174,11 +176,12 @@ class BorderedNewton:
             Distance from the guess, in lengths, up to which the factors of another state begin the
             solve.
         max_step
-            A longer step, in lengths, ends the solve early, and so do steps that lead astray: see
-            `Iterates.stops_early`.
+            A longer step, in lengths, ends the solve early. If it is finite, steps that lead astray
+            end the solve early too: a shorter step of the path then costs less.
         """
         options = SolveOptions(stress, reuse_distance, max_step)
         extrapolating = replace(options, extrapolating=self._tangent.may_extrapolate)
+        # full steps, with extrapolated forces where these are allowed
         result = self._run_snes(self._full_steps, guess, name, row, extrapolating)
         # again with computed forces, unless these would lead away as well
         if not result.converged and self._callbacks.extrapolating:
@@ -190,6 +193,7 @@ class BorderedNewton:
             return result
         if not (search and self._line_search):
             return result
+        # soft faces that become harder, then a line search
         second_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(
             self._line_search, guess, name, row, SolveOptions(stress, searched=True)
         )
@@ -256,7 +260,7 @@ class BorderedNewton:
         u, mu = callbacks.split(self._x)
         # the test of convergence has computed one more step, which is taken as well
         if converged and (step := callbacks.step_at(self._x)):
-            u, mu = add_scaled((u, mu), -1.0, step)
+            u, mu = add_scaled((u, mu), -1.0, step)  # (u, mu) less the step
         self._work.iterations += iterations
         reason = "converged" if converged else REASON_MESSAGES.get(code, f"SNES reason {code}")
         state = guess.with_(u, name, mu)
@@ -340,38 +344,40 @@ class BorderedNewton:
         needs_inertia
             If not, the number of negative pivots is meaningless.
         """
-        comm, factored = self.system.comm, self._tangent.state
-        distance = np.inf
-        if factored is not None:
-            distance = max_abs(comm, state.u - factored.u) / self.system.length
+        factored = self._tangent.state  # None if no factors are known
+        distance = self._distance(state, factored)
         reuses_factors = distance <= self.options.reuse_distance and may_lag and not exact
         if reuses_factors and needs_inertia:
             reuses_factors = self._tangent.inertia_is_certain
+        matrix_state = factored if reuses_factors and factored else state
         matrix = self._bordered_matrix(
-            factored if reuses_factors and factored else state,
-            name,
-            row,
-            may_lag=may_lag,
-            needs_inertia=needs_inertia,
+            matrix_state, name, row, may_lag=may_lag, needs_inertia=needs_inertia
         )
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
-        # the matrix is not quite that of the solution
+        # the matrix is not quite that of the solution: its tangent is refined by differences
         if (distance and reuses_factors) or self._tangent.lagged:
+            extrapolating = self._tangent.may_extrapolate
             refined = refined_tangent(
-                self.system,
-                matrix,
-                tangent,
-                state,
-                load,
-                row,
-                extrapolating=self._tangent.may_extrapolate,
+                self.system, matrix, tangent, state, load, row, extrapolating=extrapolating
             )
             if refined is None:  # too far: with a matrix of the solution itself
                 return self.response(state, name, row, may_lag=False)
             tangent = refined
         du, dmu = tangent
-        softness = -dot(comm, load, du) / dmu - self.system.curvature(state.u, state.mu, name, name)
+        # q = -dPi/dmu: dq = -R_mu . du - Pi_mumu dmu
+        softness = -dot(self.system.comm, load, du) / dmu - self.system.curvature(
+            state.u, state.mu, name, name
+        )
         return Response(du, dmu, softness, self.factorisation.negative_pivots)
+
+    def _distance(self, state: State, factored: State | None) -> float:
+        """Return the largest difference of an entry of u of two states, in lengths.
+
+        It is infinite if the second state is None. Collective.
+        """
+        if factored is None:
+            return np.inf
+        return max_abs(self.system.comm, state.u - factored.u) / self.system.length
 
     def _bordered_matrix(
         self, state: State, name: str, row: ConstraintRow, *, may_lag: bool, needs_inertia: bool

@@ -10,11 +10,14 @@ mu is the amplitude (load parameter) that varies; q = -dPi/dmu is its conjugate,
 which it does work. s is the controlled quantity: mu, q or the arc length, and a point's tangent is
 d(u, mu)/ds. Arc length is measured from a base point along its tangent, or along the direction
 `across` where the path turns sharply. Inertia is the number of unstable directions, from negative
-pivots. Predictors are the points that a polynomial through them and their tangents extrapolates.
-Lengths are displacements in units of the system's length. `stress` are weighted displacements: the
-tangent matrix takes the sum of their stresses in place of the stress of u, since small errors of a
-guess u change its own stress much. Results pass through a journal, from which an interrupted run
-resumes.
+pivots. Predictors are the last points: a polynomial through them, with their tangents,
+extrapolates the next one. Lengths are displacements in units of the system's length. The argument
+`stress` is a list of displacements with weights: the tangent matrix takes the weighted sum of their
+stresses in place of the stress of u, since small errors of a guess u change its own stress much.
+Results pass through a journal, from which an interrupted run resumes.
+
+A point has its state (u, mu), its tangent (du, dmu) and its s. Its `normal` is the direction along
+which arc length is measured from it: `across` if it is set, else the tangent.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -119,9 +122,16 @@ class Path:
         Called with the state of a point and a predicted state. It returns the onset and loss of
         forces on the straight segment between them; None: forces never begin within a step.
 
+    Attributes
+    ----------
+    system
+        The system that `newton` solves.
+    metric
+        The inner product and norm of directions (du, dmu), which define arc length.
+
     The private field `_hard_solves` counts solves that failed or took many factorisations,
     `_successive_failures` solves that failed one after the other. They decide how later solves are
-    tried.
+    tried. `_journal` and `_step_event` are the parameters of these names.
     """
 
     def __init__(
@@ -162,7 +172,7 @@ class Path:
         response = self.newton.response(state, self.name, row, exact=True)
         if not np.isfinite(dot(self.system.comm, response.du, response.du)):
             raise NotANumber("the tangent at its begin is not a number")
-        # rate: ds/dmu, by which the tangent is divided
+        # rate: ds/dmu. The tangent per unit of mu, divided by it, is the tangent per unit of s
         if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         else:
@@ -203,8 +213,11 @@ class Path:
         """
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
-        ends = (low,) if base.across else (low, high)  # towards a kink, not around it
+        # `across` is set if the path turns sharply at a kink ahead: a straight line from `low` then
+        # leads towards the kink, while a cubic would bend around it
+        ends = (low,) if base.across else (low, high)
         guess = self.interpolated_state(s, *ends)
+        # factors of the other end begin the solve only if the inertia of the result is not needed
         neighbour = None if needs_inertia else high.state
         return self.solve(
             self._row(s, base), s, guess, stress, neighbour=neighbour, needs_inertia=needs_inertia
@@ -292,54 +305,89 @@ class Path:
         needs_inertia
             Whether the numbers of unstable directions of the point must be valid.
         """
-        # a tangent of the path must not depend on what was factored before its point
-        reuse_distance = FACTOR_REUSE_DISTANCE if neighbour else 0.0
-
-        def solve() -> Point | str:
-            """Run Newton's method, and compute the tangent at its result."""
-            if neighbour:
-                # any known factors serve; for the inertia, close to the neighbour, only near ones
-                distance = np.inf
-                reach = FACTOR_REUSE_DISTANCE * self.system.length
-                if needs_inertia and max_abs(self.system.comm, guess.u - neighbour.u) < reach:
-                    distance = FACTOR_REUSE_DISTANCE
-                self.newton.ensure_factors_near(neighbour, distance)
-            count = self.newton.factorisation.count
-            result = self.newton.solve(
-                guess,
-                self.name,
-                row,
-                stress,
-                search=self._successive_failures < FAILURES_BEFORE_NO_SEARCH,
-                reuse_distance=reuse_distance,
-                max_step=max_step,
+        point = self.recorded(
+            lambda: self._newton_point(
+                row, s, guess, stress, neighbour, max_step=max_step, needs_inertia=needs_inertia
             )
-            if not result.converged:
-                return result.reason
-            factorisations = self.newton.factorisation.count - count
-            response = self.newton.response(
-                result.state,
-                self.name,
-                row,
-                exact=self._has_many_hard_solves,  # extrapolated stress is as good as the tangent
-                needs_inertia=needs_inertia,
-            )
-            return replace(
-                self._point(result.state, s, response),
-                iterations=result.iterations,
-                factorisations=factorisations,
-                error=result.error,
-            )
-
-        point = self.recorded(solve)
-        # a guess that is too far away says nothing about the stress
+        )
         if isinstance(point, str):
+            # a solve that failed was hard, unless its guess was too far away: this says nothing
+            # about the stress
             self._hard_solves += point != GUESS_TOO_FAR
             self._successive_failures += 1
         else:
             self._hard_solves += point.factorisations >= self.options.hard_factorisations
             self._successive_failures = 0
         return point
+
+    def _newton_point(
+        self,
+        row: ConstraintRow,
+        s: float,
+        guess: State,
+        stress: Sequence[WeightedDisplacement],
+        neighbour: State | None,
+        *,
+        max_step: float,
+        needs_inertia: bool,
+    ) -> Point | str:
+        """Return the point that Newton's method finds, or the reason why it fails; not recorded.
+
+        Parameters
+        ----------
+        row, s
+            The equation that is solved together with equilibrium, and the s of the point.
+        guess, stress
+            Where the method begins, and what gives the stress of its first matrix.
+        neighbour
+            A nearby solution, whose factors may begin the solve; None: no other factors may.
+        max_step
+            A longer step, in lengths, ends the solve as failed.
+        needs_inertia
+            Whether the numbers of unstable directions must be valid.
+        """
+        if neighbour:
+            self._prepare_factors(guess, neighbour, needs_inertia=needs_inertia)
+        count = self.newton.factorisation.count
+        result = self.newton.solve(
+            guess,
+            self.name,
+            row,
+            stress,
+            search=self._successive_failures < FAILURES_BEFORE_NO_SEARCH,
+            # without a neighbour the result must not depend on what was factored before
+            reuse_distance=FACTOR_REUSE_DISTANCE if neighbour else 0.0,
+            max_step=max_step,
+        )
+        if not result.converged:
+            return result.reason
+        factorisations = self.newton.factorisation.count - count
+        # after many hard solves the tangent is computed with the matrix of the point itself
+        response = self.newton.response(
+            result.state,
+            self.name,
+            row,
+            exact=self._has_many_hard_solves,
+            needs_inertia=needs_inertia,
+        )
+        return replace(
+            self._point(result.state, s, response),
+            iterations=result.iterations,
+            factorisations=factorisations,
+            error=result.error,
+        )
+
+    def _prepare_factors(self, guess: State, neighbour: State, *, needs_inertia: bool) -> None:
+        """Factor the tangent at a neighbour of a guess, unless known factors serve. Collective.
+
+        Any known factors serve, however far their state is. If the inertia is needed and the guess
+        is close to the neighbour, only factors of a state near the neighbour serve.
+        """
+        distance = np.inf
+        reach = FACTOR_REUSE_DISTANCE * self.system.length
+        if needs_inertia and max_abs(self.system.comm, guess.u - neighbour.u) < reach:
+            distance = FACTOR_REUSE_DISTANCE
+        self.newton.ensure_factors_near(neighbour, distance)
 
     @property
     def _has_many_hard_solves(self) -> bool:
@@ -368,7 +416,9 @@ class Path:
         if isinstance(result, Point):
             result = replace(result, habit=factors.habit)
         else:
-            factors.habit = habit_before  # of a failure only the reason is stored
+            # the journal stores only the reason of a failure, so a replay could not restore a
+            # habit that the failed solve has changed
+            factors.habit = habit_before
         self._journal.record(result)
         return result
 
@@ -402,15 +452,18 @@ class Path:
             Number of unstable directions of the state at fixed amplitudes.
         """
         du, dmu = direction
-        # dq is the change of the conjugate q, and `rate` the change of s, along the direction
         u, mu, name = state.u, state.mu, self.name
+        # change of the conjugate q = -dPi/dmu along the direction; curvature is d2Pi/dmu2
         curvature = self.system.curvature(u, mu, name, name)
         dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - curvature * dmu
         softness = dq / dmu if dmu else np.inf
+        # s of the point, and its change along the direction
         if self.control == "arc":
-            s, rate = self._arc_length(state, base), self.metric.inner(base.normal, direction)
+            s = self._arc_length(state, base)
+            rate = self.metric.inner(base.normal, direction)
         else:
-            s, rate = self.value(self.control, state), dmu if self.control == "load" else dq
+            s = self.value(self.control, state)
+            rate = dmu if self.control == "load" else dq
         response = Response(du, dmu, softness, negative_pivots)
         return self._point(state, s, response).with_tangent_per(rate)
 
@@ -428,7 +481,8 @@ class Path:
     def as_base(self, point: Point) -> Point:
         """Return a point with a tangent of length one, as base from which arc length is measured.
 
-        The point is unchanged with another control, or if its arc length goes along `across`.
+        The point is unchanged with control by load or conjugate, or if its `across` is set: then
+        the tangent is not the direction of its arc length.
         """
         if self.control != "arc" or point.across:
             return point
@@ -462,6 +516,7 @@ class Path:
         squared_norm = self.metric.inner((point.du, 0.0), (point.du, 0.0))
         if not squared_norm:
             return point
+        # du over |du|^2: its inner product with du is one, so s grows as along the tangent
         return replace(point, across=(np.asarray(point.du / squared_norm, dtype=np.float64), 0.0))
 
     def value(self, quantity: Quantity, state: State) -> float:
@@ -542,23 +597,26 @@ class Path:
         distance = target - current.s
         length = controller.length(distance)
         length = min(length, self._length_past_fold(points, length))
-        # the polynomial that predicted the last point better predicts the next: `smooth` is whether
-        # that is the quintic through three points, not the cubic through two
+        # the polynomial that predicted the last point better predicts the next one: the quintic
+        # through three points, or the cubic through two
         cubic_error, quintic_error = self._prediction_errors(points)
-        smooth = quintic_error < cubic_error
-        # with three points the quintic has no error yet, but shows that of the cubic
+        takes_quintic = quintic_error < cubic_error
+        # the quintic shows the error of the cubic, by which the step is shortened. It needs three
+        # points for this, but four to show its own error
         is_third_point = len(points) == PREDICTOR_POINTS - 1
-        if smooth or (is_third_point and not self.newton.options.has_onsets):
+        if takes_quintic or (is_third_point and not self.newton.options.has_onsets):
             end = current.s + np.copysign(length, distance)
             length *= self._predictable_fraction(points, end, cubic_error)
         s = target if length == abs(distance) else current.s + np.copysign(length, distance)
-        predictors = points[-3:] if smooth else points[-2:]
+        predictors = points[-3:] if takes_quintic else points[-2:]
         s = step_end(s, predictors)
         # the onset of forces on the way, unless no solution was found behind it before
         event = StepEvent()
         if current is not controller.onset_without_solution:
             event = self._event(current.state, self.predicted_state(s, predictors))
-        if event.loses_forces:  # then only the tangent predicts, perhaps other onsets
+        # where forces are lost, earlier points mislead: the tangent at the current point alone
+        # predicts the end, and the onsets on the way there may be others
+        if event.loses_forces:
             predictors = points[-1:]
             event = self._event(current.state, self.predicted_state(s, predictors))
         if event.fraction < 1:
@@ -598,7 +656,8 @@ class Path:
         current = controller.current
         point = self.measured_from(current, rejected.point)
         length = (point.s - current.s) * sense  # negative if the point lies behind
-        # the inertia of a nearby matrix serves where it shows no instability
+        # the inertia may be that of a nearby matrix (not `exact`): it serves only where it shows no
+        # instability
         has_inertia = rejected.exact or not point.has_instability_since(current)
         if length > 0 and has_inertia:
             point = self.relative_to(current, point)
@@ -635,6 +694,7 @@ class Path:
         The cubic goes through the two points before the last one, the quintic through three. An
         error is the largest displacement; it is infinite if there are too few points.
         """
+        # n counts the last point too
         return [
             self._prediction_error(points[-n:-1], points[-1]) if len(points) >= n else np.inf
             for n in (3, 4)
@@ -696,14 +756,17 @@ class Path:
 
     def _hermite_state(self, s: float, points: Sequence[Point]) -> State:
         """Return the state at `s` of the Hermite polynomial through points with their tangents."""
-        last_point, name = points[-1].state, self.name
-        u, mu = np.array(last_point.u), last_point.mu[name]
+        last_state, name = points[-1].state, self.name
+        u, mu = np.array(last_state.u), last_state.mu[name]
+        # for each point the weight of its value and that of its tangent
         weights = hermite(s, [point.s for point in points])
-        for (value, slope), point in zip(weights, points, strict=True):
-            # what does not move stays, to the last digit
-            u += value * (point.state.u - last_point.u) + slope * point.du
-            mu += value * (point.state.mu[name] - last_point.mu[name]) + slope * point.dmu
-        return last_point.with_(u, name, float(mu))
+        for (value_weight, slope_weight), point in zip(weights, points, strict=True):
+            # differences from the last state are summed: unknowns that do not move keep their
+            # value to the last digit
+            u += value_weight * (point.state.u - last_state.u) + slope_weight * point.du
+            mu_change = point.state.mu[name] - last_state.mu[name]
+            mu += value_weight * mu_change + slope_weight * point.dmu
+        return last_state.with_(u, name, float(mu))
 
     def _try_step(self, s: float, predictors: Sequence[Point]) -> Point | RejectedPoint | str:
         """Predict and correct the point at `s`.
@@ -753,7 +816,8 @@ class Path:
             and abs(next_point.s - current.s) > self.options.max_step_past_several
         ):
             return "the step passed several instabilities, or jumped to another branch"
-        # a kink is no instability, except where the load turns back
+        # a kink changes no inertia, except where the load turns back there: then arc length is
+        # measured along `across`
         may_have_kink = self.newton.options.has_onsets and (
             changed_pivots == 0 or current.across is not None
         )
@@ -768,7 +832,7 @@ class Path:
         be nearly the displacement of the step.
         """
         chord = next_point.state.u - current.state.u
-        # the trapezoidal rule: what the mean of both tangents leaves of the displacement
+        # the displacement of the step less that by the trapezoidal rule, from both tangents
         unexplained = chord - (next_point.s - current.s) / 2 * (current.du + next_point.du)
         gap, distance = (
             max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
@@ -803,8 +867,8 @@ class Path:
     def _passes_kinks(self, current: Point, rejected: RejectedPoint, plan: StepPlan) -> bool:
         """Return whether the shortest step turns sharply at kinks, where points of a body touch.
 
-        Such a step is accepted. Half as long a step would end before a kink that is just ahead, or
-        behind two that are close.
+        Such a step is accepted. Halving it further would not help: the shorter step would end
+        before a kink that lies just ahead, or behind two kinks that are close together.
 
         Parameters
         ----------
@@ -855,13 +919,16 @@ class Path:
         It follows the tangent of the first point up to the kink, then that of the second.
         """
         comm, length = self.system.comm, next_point.s - current.s
+        # change of the tangent at the kink
         turn = next_point.du - current.du
-        # from the straight path along the first tangent
+        # the second point less the end of a straight path along the first tangent
         deviation = next_point.state.u - current.state.u - length * current.du
         square = dot(comm, turn, turn)
-        # least squares: the length in s behind the kink, at most that of the step
+        # with one kink the deviation is `turn` times the length in s behind the kink; least squares
+        # give this length, which is at most that of the step
         after_kink = dot(comm, turn, deviation) / square if square else 0.0
         after_kink = min(max(after_kink / length, 0.0), 1.0) * length
+        # the part of the displacement that the kink does not explain, and the whole displacement
         gap = max_abs(comm, deviation - after_kink * turn)
         distance = max_abs(comm, deviation + length * current.du)
         return gap <= max(self.options.max_gap * distance, ZERO_DISPLACEMENT * self.system.length)
@@ -902,12 +969,13 @@ class Path:
         return self.prescribed(self.control, s)
 
     def _point(self, state: State, s: float, response: Response) -> Point:
-        """Return a point with its tangent and its numbers of unstable directions, at fixed mu or q.
+        """Return a point with its tangent and two numbers of unstable directions.
 
-        With the conjugate q held instead of mu, there is one unstable direction less where dq/dmu <
-        0. This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the
-        Schur complement. An amplitude that is a position has a force as q: with the force held, the
-        position is free, and there is one more instead where dq/dmu >= 0.
+        One number is for a fixed amplitude mu. The other is for a fixed conjugate q, where mu is
+        free; by Haynsworth's inertia additivity it follows from dq/dmu = R_mu . K^-1 R_mu -
+        Pi_mumu, which is minus a Schur complement. If mu is a load, a fixed displacement q is a
+        constraint: one unstable direction less where dq/dmu < 0. If mu is a position, a fixed force
+        q makes it a further unknown: one more where dq/dmu >= 0.
 
         Parameters
         ----------
@@ -915,9 +983,9 @@ class Path:
             The tangent, its softness dq/dmu, and the number of negative pivots at fixed amplitudes.
         """
         pivots = response.negative_pivots
-        pivots_held = (
-            pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)
-        )
+        mu_is_load = self.name not in self.system.coordinates
+        # with a fixed q
+        pivots_held = pivots + int(response.softness >= 0) - int(mu_is_load)
         return Point(state, s, response.du, response.dmu, pivots, pivots_held)
 
     def with_step_options(self, options: StepOptions) -> "Path":

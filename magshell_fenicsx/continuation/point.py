@@ -31,7 +31,8 @@ class Point:
     negative_pivots
         Number of unstable directions at fixed amplitudes.
     negative_pivots_held
-        Number of unstable directions with the conjugate displacement held instead of the amplitude.
+        Number of unstable directions where the conjugate displacement is fixed and the amplitude is
+        free.
     iterations, factorisations
         Work since the previous point.
     error

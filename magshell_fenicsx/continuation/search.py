@@ -80,14 +80,10 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     # a multiple of b that is as large as the residual: the amplitude of the force is of order one
     scale = np.sqrt(dot(system.comm, residual, residual) / square) or 1.0
     b = np.asarray(b * scale)
-    # the equilibrium with the force, which begins as the least squares fit of the residual
+    # the amplitude `FORCE` of this solver is t
     holder = newton.for_system(HoldingForceSystem(system, b))
-    force = -dot(system.comm, b, residual) / dot(system.comm, b, b)
-    # the component of u along b stays; without known solutions, steps are only shortened
-    row = PrescribedConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
-    start = find_deflated(holder, State(guess.u, {**guess.mu, FORCE: force}), FORCE, row)
-    result = holder.solve(start, FORCE, row) if start else None
-    if result is None or not result.converged:
+    held_state = _held_state(holder, guess, b, residual)
+    if held_state is None:
         return
     options = StepOptions(
         first=FIRST_STEP,
@@ -95,10 +91,10 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
         smallest=MIN_STEP_RATIO * FIRST_STEP,
     )
     path = Path(holder, FORCE, "arc", options, scale=FORCE_SCALE)
-    first_force = result.state.mu[FORCE]
+    first_force = held_state.mu[FORCE]
     max_force = MAX_FORCE_RATIO * abs(first_force)
-    last_point = path.start(result.state, -float(np.copysign(1.0, first_force)))
-    # the path of the force, to where it is zero
+    # the path of the force, to where it is zero; at first its size falls
+    last_point = path.start(held_state, -float(np.copysign(1.0, first_force)))
     try:
         for count, (point, _) in enumerate(path.continue_to(last_point, [np.inf]), 1):
             force_before, force_after = (
@@ -113,6 +109,30 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
                 return
     except PathStopped:
         return
+
+
+def _held_state(holder: BorderedNewton, guess: State, b: Vector, residual: Vector) -> State | None:
+    """Return the equilibrium near a guess with a force t b; None if it is not found. Collective.
+
+    The component of u along b stays that of the guess.
+
+    Parameters
+    ----------
+    holder
+        Solver of the system with the force, whose amplitude `FORCE` is t.
+    residual
+        The residual at the guess without the force.
+    """
+    comm = holder.system.comm
+    # the first t makes the residual as small as possible, by least squares
+    force = -dot(comm, b, residual) / dot(comm, b, b)
+    row = PrescribedConjugate(holder.system, FORCE, -dot(comm, b, guess.u))
+    # no solutions are deflated here: the method only shortens its steps
+    start = find_deflated(holder, State(guess.u, {**guess.mu, FORCE: force}), FORCE, row)
+    result = holder.solve(start, FORCE, row) if start else None
+    if result is None or not result.converged:
+        return None
+    return result.state
 
 
 def _state_without_force(path: Path, base: Point, high: Point) -> State:
@@ -153,6 +173,9 @@ class Settling:
     passes
         Called with the states before and after a step. It returns whether shells would pass through
         each other; the step is then refused.
+
+    Private fields: `_K0` is the matrix K0, `_K0_factors` are its factors, and `_factors` those of
+    the latest K + s K0.
     """
 
     system: System
@@ -186,7 +209,7 @@ class Settling:
                     continue
                 du = -self._factors.solve(residual)
                 next_residual = system.residual(u + du, guess.mu)
-                # the residual that a linear system would not leave
+                # a linear system would leave the residual -shift K0 du: what is left beside it
                 unexplained_force = next_residual + shift * self._K0_factors.times(du)
                 unexplained = self._size(unexplained_force) / self._size(residual)
                 is_accepted = unexplained <= MAX_UNEXPLAINED and not self.passes(
@@ -326,9 +349,8 @@ def further_solutions(
     rules
         Conditions on shells in contact; None: there are none.
     """
-    search = _SolutionSearch(
-        path, [start], descend, limits.time_is_over, rules or AcceptanceRules()
-    )
+    is_over, rules = limits.time_is_over, rules or AcceptanceRules()
+    search = _SolutionSearch(path, [start], descend, is_over, rules)
     queue = [SearchGuess(make, start, displacement, reachable=True) for make in guesses]
     queue += search.guesses_along_mode(start, displacement)
     accepted = 0
@@ -336,28 +358,31 @@ def further_solutions(
         attempts = [*([search.by_descent] if descend else []), search.by_newton, search.by_release]
         while attempts:
             attempt = attempts.pop(0)
-            path.progress.doing(
-                f"searching: guess {number} of at most {limits.guesses}, "
-                f"solutions found: {accepted}"
-            )
-            point = path.recorded(partial(_unless_over, limits.time_is_over, attempt, guess))
+            _report(path, number, limits, accepted)
+            point = path.recorded(partial(_unless_over, is_over, attempt, guess))
             if point == TIME_IS_OVER:
                 return
-            if isinstance(point, str):
-                continue
-            point = search.accept_by_rules(guess, point)
-            if isinstance(point, str):
+            if not isinstance(point, str):
+                point = search.accept_by_rules(guess, point)
+            if isinstance(point, str):  # the reason of a failure
                 continue
             search.known_solutions.append(point.state)
             queue += search.guesses_along_mode(point.state, displacement)
-            # of a search for stable solutions an unstable one does not count
+            # an unstable solution does not count where stable ones are searched for
             accepted += not (descend and point.negative_pivots)
             yield point
             if accepted == limits.solutions:
                 return
-            attempts = [search.by_newton]  # which may find another one now
+            attempts = [search.by_newton]  # with this one deflated, it may find another one
         if number == limits.guesses:
             return
+
+
+def _report(path: Path, number: int, limits: SearchLimits, accepted: int) -> None:
+    """Report that a guess is tried: its number, and the number of solutions accepted so far."""
+    path.progress.doing(
+        f"searching: guess {number} of at most {limits.guesses}, solutions found: {accepted}"
+    )
 
 
 def _unless_over(
@@ -396,6 +421,10 @@ class _SolutionSearch:
     ----------
     known_solutions
         The solutions so far.
+
+    Private fields: `_solver` is a path like `_path`, but without a journal. `_value` is the
+    amplitude of all solutions, and `_row` the equation that prescribes it. `_over`, `_descend` and
+    `_rules` are the parameters `time_is_over`, `descend` and `rules`.
     """
 
     def __init__(

@@ -11,9 +11,13 @@ scalar equation that is solved together with equilibrium for u and the amplitude
 mu. A direction is a pair (du, dmu). A kept matrix gets Broyden's updates (`Chord`), and is an
 iterate's own if it was computed there. Dense terms couple all unknowns: their part of K may lag,
 that is belong to an earlier state, and their forces may be extrapolated from earlier states while
-steps are long. `stress` are weighted displacements whose stress replaces that of u in K, since
-small errors of a guess u change its own stress much. Lengths are displacements in units of the
-system's length.
+steps are long. The argument `stress` is a list of displacements with weights: the weighted sum of
+their stresses replaces the stress of u in K, since small errors of a guess u change its own stress
+much. Lengths are displacements in units of the system's length.
+
+`Iterates` has the steps of a solve with their sizes and judges by these whether it has converged. A
+step is `is_own` if the matrix of that iterate made it. A system is an `InexactSystem` if its dense
+terms may lag or be extrapolated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -280,14 +284,19 @@ class SolveOptions:
 
     Attributes
     ----------
-    stress, reuse_distance, max_step
-        See `BorderedNewton.solve`.
+    stress
+        Weighted displacements whose stress replaces that of the guess in the first matrix.
+    reuse_distance
+        Distance from the guess, in lengths, up to which the factors of another state begin the
+        solve.
+    max_step
+        A longer step, in lengths, ends the solve early.
     searched
         Whether a line search shortens the steps.
     extrapolating
         Whether forces of dense terms may be extrapolated.
     relative_tolerance
-        See `Iterates`.
+        An error of this fraction of the first step is accepted.
     """
 
     stress: Sequence[WeightedDisplacement] = ()
@@ -318,9 +327,12 @@ class SnesCallbacks:
 
     Private fields: `_state` is the present iterate and `_next` the next step there, to be
     subtracted. `_x_counter`, `_f_counter` and `_f_handle` identify PETSc's vectors x and f to which
-    that step belongs. `_chord` applies the matrix with Broyden's updates. `_is_extrapolated` tells
-    whether the present residual has extrapolated forces, `_largest_step` is the size of the largest
-    step since forces were computed, and `_computed_steps` are sizes of steps with computed forces.
+    that step belongs. `_chord` applies the matrix with Broyden's updates: its `step` is the next
+    step for a residual. `_iterates` has the steps of the solve so far. `_stress` are the weighted
+    displacements for the next matrix, and `_has_stress` tells whether the guess came with some.
+    `_is_extrapolated` tells whether the present residual has extrapolated forces, `_largest_step`
+    is the size of the largest step since forces were computed, and `_computed_steps` are sizes of
+    steps with computed forces. The other ones are the arguments of `begin`.
     """
 
     def __init__(self, tangent: LatestTangent, options: NewtonOptions) -> None:
@@ -377,7 +389,10 @@ class SnesCallbacks:
         return self._next if x.stateGet() == self._x_counter else None
 
     def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """Write the residuals R of equilibrium and g of the row into f; PETSc's callback."""
+        """Write the residuals R of equilibrium and g of the row into f; PETSc's callback.
+
+        `snes` is not used here: PETSc passes it to every callback.
+        """
         self._is_extrapolated = self.extrapolating
         self._compute(self._state_of(x), f)
 
@@ -475,13 +490,15 @@ class SnesCallbacks:
     def _extrapolated_size(self, state: State) -> float:
         """Return the size down to which a step may use extrapolated forces, in lengths.
 
-        For a smaller step the forces are computed. The result is negative once computed forces have
-        shown an error far below the tolerance.
+        For a smaller step the forces are computed. The result is negative, so that they never are
+        again, once computed forces have shown an error far below the tolerance.
         """
         converged = self._converged_size(state)
-        # one ratio is enough here: each costs much
-        if extrapolated_error(self._computed_steps, 1) <= CERTAIN_ERROR * converged:
+        # the error after the last step with computed forces, from the ratio of only two steps: each
+        # computation of these forces costs much
+        if extrapolated_error(self._computed_steps, ratios=1) <= CERTAIN_ERROR * converged:
             return -1.0
+        # the limit falls with every computation
         ratio = float(EXTRAPOLATED_STEP_RATIO ** (1 + len(self._computed_steps) / 2))
         return max(converged, ratio * self._largest_step)
 
@@ -494,9 +511,11 @@ class SnesCallbacks:
         if not (self._is_extrapolated and self._state and self._chord and self.matrix):
             return True
         state, size = self._state, self._iterates.steps[-1].size
-        R = self._system.residual(state.u, state.mu), self._row.residual(state)
-        # with computed forces the step is at most half as long
-        return not self.matrix.size(self._chord.step(R)) > QUADRATIC_RATIO * size
+        # (R, g) with computed forces, and the step that they make
+        computed_residual = self._system.residual(state.u, state.mu), self._row.residual(state)
+        computed_size = self.matrix.size(self._chord.step(computed_residual))
+        # misled: with computed forces the step is at most half as long
+        return not computed_size > QUADRATIC_RATIO * size
 
     def _repeated_step(self, f: Direction) -> Direction:
         """Replace the last step, which had extrapolated forces, by that for a residual `f`.
@@ -518,14 +537,14 @@ class SnesCallbacks:
         """
         assert self._chord
         assert self._next
-        # where a full step leads
-        after_full = add_scaled((previous.u, previous.mu[self._name]), -1.0, self._next)
-        is_full = after_full[1] == state.mu[self._name] and np.array_equal(after_full[0], state.u)
+        # where a full step would lead; on all ranks the new iterate must be that place
+        u_after, mu_after = add_scaled((previous.u, previous.mu[self._name]), -1.0, self._next)
+        is_full = mu_after == state.mu[self._name] and np.array_equal(u_after, state.u)
         is_full = bool(self._system.comm.allreduce(is_full, MPI.LAND))
         if is_full:
             self._chord.accept_step(self._next)
         else:
-            self._chord = None
+            self._chord = None  # no chord: the next step takes a new matrix
         # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano,
         # Leonetti, Garcea, Computer Methods in Applied Mechanics and Engineering 313, 2017)
         du = -self._next[0] if is_full else state.u - previous.u
@@ -538,6 +557,7 @@ class SnesCallbacks:
         size is appended to the steps of the solve.
         """
         steps = self._iterates.steps
+        # the latest matrix, with Broyden's updates
         if self._chord and self.matrix:
             step = self._chord.step(f)
             size = self.matrix.size(step)
@@ -585,14 +605,19 @@ class SnesCallbacks:
         step
             The step by the matrix.
         """
+        # sizes of earlier steps by matrices of their own iterates
         own_sizes = [s.size for s in self._iterates.steps if s.is_own]
         size, contraction = matrix.size(step), self._options.late_contraction
         if not (self._tangent.lagged and own_sizes):
             return False
+        # the step shrinks enough, or is so long that a renewed part would soon be too old
         if not contraction * own_sizes[-1] < size < MAX_STEP_WITH_RENEWAL:
             return False
-        missing = self._tangent.latest.missing_product(step[0])
-        return not matrix.size(matrix.solve(missing, 0.0, low_accuracy=True)) <= contraction * size
+        du, _ = step
+        # the residual that is left after the step, and the size of the next step that it causes
+        missing = self._tangent.latest.missing_product(du)
+        next_size = matrix.size(matrix.solve(missing, 0.0, low_accuracy=True))
+        return not next_size <= contraction * size
 
     def _matrix_serves(self, size: float) -> bool:
         """Return whether to keep the matrix, whose next step has this size in lengths.
@@ -627,14 +652,16 @@ class SnesCallbacks:
         matrix = self.matrix
         assert matrix
         signs = np.random.default_rng(self._system.comm.rank).choice([-1.0, 1.0], state.u.size)
-        rounded = state.u + signs * np.spacing(state.u)
-        residual_change = self._system.residual(rounded, state.mu) - self.split(f)[0]
-        remainder = residual_change - matrix.times(rounded - state.u, 0.0)[0]
-        return matrix.size(matrix.solve(remainder, 0.0))
+        rounded_u = state.u + signs * np.spacing(state.u)
+        rounded_residual = self._system.residual(rounded_u, state.mu)
+        R, _ = self.split(f)
+        residual_change = rounded_residual - R
+        K_du, _ = matrix.times(rounded_u - state.u, 0.0)
+        return matrix.size(matrix.solve(residual_change - K_du, 0.0))
 
     def new_vector(self) -> PETSc.Vec:
         """Return a new vector (u, mu); mu is on the last rank."""
-        size = self._system.size + self._is_last_rank
+        size = self._system.size + self._is_last_rank  # one more on the last rank
         return PETSc.Vec().createMPI((size, PETSc.DETERMINE), comm=self._system.comm)
 
     def join(self, values: Direction, x: PETSc.Vec) -> None:

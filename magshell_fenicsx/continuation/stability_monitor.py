@@ -64,6 +64,9 @@ class PathSegment:
     ----------
     low, high
         The two points.
+
+    Private fields: `_low` is the first point, as base of the arc length of all others. `_points`
+    are all known points of the segment, in the order of the path.
     """
 
     def __init__(self, path: Path, low: Point, high: Point) -> None:
@@ -111,10 +114,14 @@ class PathSegment:
     def _crossings_between(
         self, low: Point, high: Point, change: InertiaChange, counts: dict[int, int], halvings: int
     ) -> Iterator[tuple[Point, int]]:
-        """Yield the crossings between two points, as `crossings` does.
+        """Yield each crossing between two points, with its change of the number of unstable modes.
 
         Parameters
         ----------
+        low, high
+            Two points of the segment, in the order of the path.
+        change
+            The tangent of the family, and its numbers at the ends of the whole segment.
         counts
             Identity `id` of a point -> number of unstable directions of the family there; new
             points are added.
@@ -263,8 +270,8 @@ class _InertiaEvaluation:
         Magnitude of the eigenvalue nearest to zero of the only family, and its mode; infinite and
         None if there are several.
     numbers
-        Computes the array of tangents of several families, see `FamilyTangents`; None if there are
-        none.
+        Function that computes the tangents of several families at this point, as one array of
+        numbers, see `FamilyTangents`; None if there is one family.
     """
 
     point: Point
@@ -303,11 +310,13 @@ class StabilityMonitor:
         The reason why a change could not be located, for the first such change; "" if there is
         none.
 
-    Private fields: `_last_point` has the displacement `_u` and the distance `_distance` along the
-    path. `_last_evaluation` and `_previous_evaluation` are the last two ones, `_softening_rate` is
-    the change of the softest eigenvalue per distance between them. `_skipped` has the points since
-    then that were not evaluated, with their distances; `_may_skip` is how many in a row may be.
-    `_counts_before_path` are the counts at the end of the previous path.
+    Private fields: `_path` is the present path, `_expand` maps its states to those of the model,
+    and `_families` are the families whose crossings are located. `_last_point` has the displacement
+    `_u` and the distance `_distance` along the path. `_last_evaluation` and `_previous_evaluation`
+    are the last two evaluations, `_softening_rate` is the change of the softest eigenvalue per
+    distance between them. `_skipped` has the points since then that were not evaluated, with their
+    distances; `_may_skip` is how many in a row may be. `_counts_before_path` are the counts at the
+    end of the previous path.
     """
 
     def __init__(self, excluded: SymmetryBreakingModes | None) -> None:
@@ -352,7 +361,8 @@ class StabilityMonitor:
         self._counts_before_path = (
             last_evaluation.counts if last_evaluation else (0,) * len(self._families)
         )
-        # the same object: the last evaluation is that of this point
+        # the same object as at the end of the previous path, which was not skipped there: the last
+        # evaluation is that of this point
         is_last_point = start.state.u is self._u and not self._skipped
         known_evaluation = last_evaluation if is_last_point else None
         # begin anew at the first point, where nothing is known of softening
@@ -547,14 +557,16 @@ class StabilityMonitor:
         # no parabola through two points at one place
         if other.distance in (low.distance, high.distance):
             return True
+        # places of the three evaluations on the path, and functions that compute their tangents
         distances = other.distance, low.distance, high.distance
-        numbers = other.numbers, low.numbers, high.numbers
+        computations = other.numbers, low.numbers, high.numbers
 
         def find() -> RecordedValues:
             """Compute whether the matrix between the ends is indefinite for a stable family."""
             tangents_between = _inner_bernstein_coefficient(
-                distances, [compute() for compute in numbers]
+                distances, [compute() for compute in computations]
             )
+            # indices of families
             indefinite = tangents.indefinite(tangents_between)
             recovers = any(not low.counts[i] and not high.counts[i] for i in indefinite)
             return RecordedValues({"recovers": recovers})

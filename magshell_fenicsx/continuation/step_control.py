@@ -122,10 +122,10 @@ class StepController:
         distance
             Distance of the target in s, of either sign; it may be infinite.
         """
-        steps = np.inf  # to the target
+        steps = np.inf  # number of equal steps to the target
         if np.isfinite(distance):
             steps = max(1.0, np.ceil(BELOW_ONE * abs(distance) / self.step))
-        # one or two equal steps; the steps before them need not be equal
+        # the last two steps are equal; with more of them ahead the next one has its usual length
         return abs(distance) / steps if steps < 3 else self.step
 
     def reject_step(self, plan: StepPlan, reason: str, smallest: float) -> None:
@@ -147,7 +147,8 @@ class StepController:
         PathStopped
             If the next step would be shorter than the smallest.
         """
-        # behind an onset there is no solution: the same length again, which ignores the onset
+        # no solution was found just behind an onset: the step is tried again with the same length,
+        # and then goes on past the onset
         if plan.event.fraction < 1 and plan.event.ends_behind:
             self.onset_without_solution, self.rejected = self.current, None
             return
@@ -206,6 +207,7 @@ class StepController:
         length
             How far ahead it lies in s; negative if it lies behind the last point.
         """
+        # the next step ends about half way to the solution ahead
         if length > 0:
             self.step = min(self.step, max(length / 2, MIN_FRACTION_BEFORE_FOLD * self.step))
         self.rejected = rejected if rejected.retries < MAX_RETRIES else None

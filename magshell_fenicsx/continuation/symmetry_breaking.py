@@ -48,8 +48,8 @@ class SymmetryBreakingSystems(SystemFamily, Protocol):
 class SymmetryBreakingRows:
     """The rows of Newton's step at a state of a boundary: du = -w_R - dmu w_mu - dp w_p.
 
-    They are the counterpart of `augmented.AugmentedRows` for a family of symmetry-breaking modes.
-    The constructor is collective.
+    Along a boundary these rows stand in for those of a bifurcation within the model
+    (`augmented.AugmentedRows`), and so have the same methods. The constructor is collective.
 
     Parameters
     ----------
@@ -71,11 +71,12 @@ class SymmetryBreakingRows:
     v, g
         Null vector and residual of K_m v + g b = 0.
     pull, bend
-        `BoundaryPoint.pull` and `cubic`; both are zero, since v does no work on the model.
+        Work of the load along v, and third derivative of Pi along it: those tell a fold from a
+        bifurcation. Both are zero, since a mode that breaks the symmetry does no work on the model.
 
     Private fields: `_factors` are those of the model's tangent K. `_g_mu` and `_g_p` are the total
     derivatives of g by mu and p, in which u follows them. `_other_unstable` counts the unstable
-    directions of the family without v.
+    directions of the family without v. `_w_R`, `_w_mu` and `_w_p` are K^-1 times R, R_mu and R_p.
     """
 
     def __init__(
@@ -157,11 +158,13 @@ class SymmetryBreakingRows:
         is_tangent = value is None
         w_R = 0.0 * w_mu if is_tangent else self._w_R
         g = 0.0 if is_tangent or settled else self.g - self._derivative_of_g(w_R)
-        # the row along -w_mu, -w_p and -w_R
+        # changes of the row along du = -w_mu, -w_p and -w_R
         c = [-dot(comm, row.du, w) for w in (w_mu, w_p, w_R)] if row.du is not None else [0.0] * 3
-        rows = np.array([[self._g_mu, self._g_p], [c[0] + row.dmu, c[1] + row.dp]])
+        by_mu, by_p, by_residual = c
+        rows = np.array([[self._g_mu, self._g_p], [by_mu + row.dmu, by_p + row.dp]])
         # for the tangent the row changes by 1 along it
-        right_side = np.array([g, c[2] + value if value is not None else -1.0])
+        right_side = np.array([g, by_residual + value if value is not None else -1.0])
+        # both equations are divided by their largest coefficients
         size = np.abs(rows).max(axis=1)
         dmu, dp = np.linalg.solve(rows / size[:, None], -right_side / size)
         return CurveVector(-w_R - dmu * w_mu - dp * w_p, float(dmu), float(dp))

@@ -75,7 +75,8 @@ def targets_between(
     """
     low, high = points[-2:]
     low_value, high_value = path.value(quantity, low.state), path.value(quantity, high.state)
-    # from a target the path turns back at once; a shorter step sees the load rise first
+    # the step begins at a target, and the quantity changes against its sense: the path seems to
+    # turn back at once. The error makes the caller try a shorter step, which may see it rise first
     if low_value in targets and (high_value - low_value) * sense < 0:
         raise PathStopped(f"{path.name} falls from the start", low)
     # no polynomial continues behind a kink
@@ -104,7 +105,7 @@ def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point
         If the solve fails.
     """
     low, high = points[-2:]
-    # both, and earlier ones that are not too close: these would multiply rounding
+    # both points, and earlier ones that are not too close: close ones would multiply rounding
     predictors = [low, high]
     for earlier in reversed(points[:-2]):
         distance = abs(predictors[0].s - earlier.s)

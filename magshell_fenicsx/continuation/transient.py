@@ -179,6 +179,12 @@ class Integrator:
         Work so far.
     factored_state
         The state of the latest factors; None if the next step makes new ones.
+
+    Private fields: `_free` are names of amplitudes that the device makes unknown, `_driven` those
+    of all positions that move. `_total_energy` is the energy at the begin of the motion, from which
+    an imbalance is counted. `_K` is the matrix of a step, with the pattern of the system's tangent
+    `_tangent`. `_advance` returns a converged state with its history variables updated, from the
+    state and the amplitudes before it. `_x` and `_y` are vectors for products with the mass.
     """
 
     def __init__(
@@ -191,12 +197,7 @@ class Integrator:
         viscous: ViscousForces | None = None,
         surroundings: Surroundings | None = None,
     ) -> None:
-        """Begin without factors.
-
-        `_free` are the amplitudes that the device makes unknown, `_driven` all positions that move.
-        `_total_energy` is the energy at the begin, from which an imbalance is counted. `_K` is the
-        matrix of a step, with the pattern of the tangent `_tangent`.
-        """
+        """Begin without factors."""
         surroundings = surroundings or Surroundings()
         device = surroundings.device
         self.system, self.mass, self.loads = system, mass, loads
@@ -213,7 +214,8 @@ class Integrator:
         self._tangent: PETSc.Mat | None = None
         self.factored_state: FactoredState | None = None
         self._x, self._y = mass.createVecs()
-        # updates history variables: turns of edges under moments, whose work is counted on
+        # history variables are turns of edges under moments, which are counted on beyond a full
+        # turn; a system without them has no such function
         self._advance: Callable[[State, Amplitudes], State] = getattr(
             system, "advance", lambda state, previous: state
         )
@@ -233,6 +235,7 @@ class Integrator:
         """
         mu = self.loads(t, False)
         work, dissipated = (earlier.work, earlier.dissipated) if earlier else (0.0, 0.0)
+        # unknown amplitudes and stiffnesses of contacts go on from the earlier motion
         if earlier:
             mu |= {name: earlier.mu[name] for name in self._free} | self._contact_settings(earlier)
         inverse_mass = self._inverse_mass()
@@ -293,7 +296,9 @@ class Integrator:
     def with_imbalance(self, motion: Motion) -> Motion:
         """Return a motion with its imbalance and turnover of energy. Collective.
 
-        Without contact the balance is not checked, and the motion is returned unchanged.
+        The imbalance is the kinetic, stored and dissipated energy less the work, and less this sum
+        at the begin; the turnover is the sum of their magnitudes. Without contact the balance is
+        not checked, and the motion is returned unchanged.
         """
         if not self.contact:
             return motion
@@ -381,14 +386,13 @@ class Integrator:
         comm, length = self.system.comm, self.system.length
         if self.viscous:
             self.viscous.memory = motion.memory
-        # a guess: constant velocity or, if the last step was accurate, constant acceleration
-        u = motion.u + dt * motion.v
-        if motion.error < MAX_ERROR_FOR_PREDICTION:
-            u = u + dt**2 / 2 * motion.a
+        u = self._guessed_displacement(motion, dt)
         y = self.device.unknowns(motion.mu) if self.device else np.empty(0)
         support_forces = self._support_forces(motion, dt)
-        # sizes of the last and the first step; `growths`: successive steps that have grown
+        # sizes of the last and the first step of the iteration; `growths`: number of successive
+        # steps that have grown, of which a contact allows some
         last_size, first_size, growths = np.inf, np.inf, 0
+        max_growths = CONTACT_PATIENCE if self.contact else 0
         # factors of an earlier time step serve if it was about as long
         has_new_factors = (
             self.factored_state is None or abs(dt - self.factored_state.dt) > MAX_STEP_CHANGE * dt
@@ -406,7 +410,7 @@ class Integrator:
             step_size = max_abs(comm, du) / length
             if not np.isfinite(step_size):
                 return "the step is not a number"
-            # the displacement as a multiple of the one from which the tolerance is relative to it
+            # the tolerance is relative to a tenth of the displacement if that exceeds the length
             displacement = LENGTH_PER_DISPLACEMENT * max_abs(comm, u) / length
             # small steps that new factors do not shrink may be rounding
             stalled = (
@@ -416,16 +420,29 @@ class Integrator:
                 stalled and step_size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
             ):
                 return self._end_of_step(motion, u, y, dt)
+            # the step does not shrink enough: give up, or go on with new factors
             if step_size > REFACTOR_RATIO * last_size:
                 growths = growths + 1 if has_new_factors and step_size > last_size else 0
                 diverges = has_new_factors and step_size > max(MAX_STEP, first_size)
-                if growths > (CONTACT_PATIENCE if self.contact else 0) or diverges:
+                if growths > max_growths or diverges:
                     break
                 self._factor_step(motion, u, y, dt)
                 has_new_factors, chord = True, self._chord()
-            last_size, first_size = step_size, step_size if first_size == np.inf else first_size
+            first_size = step_size if first_size == np.inf else first_size
+            last_size = step_size
         self.factored_state = None
         return "Newton's method does not converge"
+
+    def _guessed_displacement(self, motion: Motion, dt: float) -> Vector:
+        """Return a guess of the displacement after a step of length dt.
+
+        It is that of a constant velocity or, if the last step was accurate, of a constant
+        acceleration.
+        """
+        u = motion.u + dt * motion.v
+        if motion.error < MAX_ERROR_FOR_PREDICTION:
+            u = u + dt**2 / 2 * motion.a
+        return u
 
     def _end_of_step(self, motion: Motion, u: Vector, y: Array, dt: float) -> Motion | str:
         """Return the motion at the end of a step that has converged, if no surfaces pass through.
@@ -441,7 +458,11 @@ class Integrator:
         return self._accept(motion, u, y, dt)
 
     def _chord(self) -> Chord[Vector]:
-        """Return Broyden's chord method for a residual (u, y), with the latest factors."""
+        """Return Broyden's chord method for a residual (u, y), with the latest factors.
+
+        From residuals it gives steps: with one matrix for several iterates, which Broyden's update
+        corrects after each.
+        """
         comm = self.system.comm
         return Chord(
             self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b
@@ -542,7 +563,10 @@ class Integrator:
         return join(residual, rows, self.system.comm)
 
     def _average_contact(self, motion: Motion, u: Vector, y: Array, dt: float) -> None:
-        """Replace the contact forces by their mean along a step to u and y, until reset."""
+        """Replace the contact forces by their mean along a step to u and y.
+
+        They stay so until `contact.use_state_forces()`. Without contact nothing happens.
+        """
         if self.contact:
             end = State(u, self._amplitudes(motion, y, 1.0, dt))
             self.contact.average_along(State(motion.u, motion.mu), end, 1 - self.parameters.alpha_f)
@@ -588,8 +612,10 @@ class Integrator:
         viscous = self.viscous
         tangent = viscous.tangent(u, mu, dt, rate) if viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, BorderedTangent)
+        # beside the matrix K a tangent may have a skew part N, or a dense correction D
         K = tangent.K if isinstance(tangent, SkewedTangent | CorrectedTangent) else tangent
-        # another object, as after a change of contact: another pattern
+        # the tangent is another object, for example after a change of contact: it may have another
+        # pattern, so the matrix of the step is made anew
         if self._tangent is None or self._K is None or self._tangent.handle != K.handle:
             self._tangent, self._K = K, K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -632,16 +658,7 @@ class Integrator:
             self._work(name, motion, mu, potentials, mean_forces.get(name)) for name in potentials
         )
         step, mean_velocity = u - motion.u, (1 - alpha_f) * v + alpha_f * motion.v
-        # drag times the mean velocity works along the step, at supports too
-        if self.supports and self.drag:
-            begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
-            step_of_all = step + dt / 2 * (begin + end)
-            mean_velocity = mean_velocity + (1 - alpha_f) * end + alpha_f * begin
-            dissipated = self.drag * dot(comm, step_of_all, self.supports.times(mean_velocity))
-        elif self.drag:
-            dissipated = self.drag * dot(comm, step, self._times(mean_velocity))
-        else:
-            dissipated = 0.0
+        dissipated = self._dissipated_by_drag(motion, dt, step, mean_velocity)
         error = self._error(motion, end_motion, dt)
         if self.viscous:
             dissipated += dot(comm, step, self.viscous.accept(motion.u, u, dt))
@@ -652,6 +669,29 @@ class Integrator:
             memory=self.viscous and self.viscous.memory,
         )
         return self.with_imbalance(replace(end_motion, potentials=potentials, error=error))
+
+    def _dissipated_by_drag(
+        self, motion: Motion, dt: float, step: Vector, mean_velocity: Vector
+    ) -> float:
+        """Return the work of the drag in a step: drag times mean velocity, along the displacement.
+
+        Parameters
+        ----------
+        motion, dt
+            The begin of the step, and its length.
+        step, mean_velocity
+            Displacement and mean velocity in the step, without those of moving supports; these are
+            added here.
+        """
+        comm, alpha_f, t = self.system.comm, self.parameters.alpha_f, motion.t + dt
+        if self.supports and self.drag:
+            begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
+            step_of_all = step + dt / 2 * (begin + end)
+            mean_velocity = mean_velocity + (1 - alpha_f) * end + alpha_f * begin
+            return self.drag * dot(comm, step_of_all, self.supports.times(mean_velocity))
+        if self.drag:
+            return self.drag * dot(comm, step, self._times(mean_velocity))
+        return 0.0
 
     def _error(self, motion: Motion, end_motion: Motion, dt: float) -> float:
         """Return the estimated error of a step, over the system's length.
@@ -665,7 +705,9 @@ class Integrator:
         error = abs(self.parameters.beta - 1 / 6) * dt**2 * acceleration_change / length
         if viscous is None:
             return error
-        # a motion that creeps: errors of the steps add up in its own time |v|/|a|
+        # a motion that creeps: errors of the steps add up over the time |v|/|a| in which the
+        # velocity changes, at most over the creep time. Changes of the acceleration by rounding do
+        # not count
         is_significant = dt**2 * acceleration_change > ACCELERATION_ROUNDING * length
         if viscous.creep_time > dt and is_significant:
             acceleration = max(max_abs(comm, end_motion.a), acceleration_change)
@@ -748,14 +790,12 @@ class Integrator:
             mu = self._amplitudes(motion, y, fraction, dt)
             force += weight * self.system.potential(u, mu, name)
         if supports and name in supports.names:
-            # at a jump the end of the step counts before it, the begin after it
-            end, begin = (end_motion, end_motion.t, True), (motion, motion.t, False)
-            a_end, a_begin = (
-                at.a + supports.acceleration(t, before_jump) for at, t, before_jump in (end, begin)
-            )
-            v_end, v_begin = (
-                at.v + supports.velocity(t, before_jump) for at, t, before_jump in (end, begin)
-            )
+            # accelerations and velocities of all nodes at both ends; at a jump the end of the step
+            # is before it (True), the begin after it (False)
+            a_end = end_motion.a + supports.acceleration(end_motion.t, True)
+            a_begin = motion.a + supports.acceleration(motion.t, False)
+            v_end = end_motion.v + supports.velocity(end_motion.t, True)
+            v_begin = motion.v + supports.velocity(motion.t, False)
             acceleration = (1 - alpha_m) * a_end + alpha_m * a_begin
             velocity = (1 - alpha_f) * v_end + alpha_f * v_begin
             rate = supports.displacement_rate(self._amplitudes(motion, y, 1 - alpha_f, dt), name)

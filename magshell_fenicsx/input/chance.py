@@ -69,6 +69,7 @@ class DistributionSection(Section):
         allowed = {*required, *OPTIONAL_KEYS.get(self.kind, ())}
         if unexpected := sorted(given_keys - allowed):
             raise ValueError(f"{unexpected[0]} does not belong to kind: {self.kind}")
+        # the bounds, the mean of a positive number, and what lies between the bounds
         low, high = self._bounds
         if low >= high:
             raise ValueError(f"above must be less than below, here {low:g} and {high:g}")
@@ -95,7 +96,7 @@ class DistributionSection(Section):
     def quantile(self, probability: float) -> Value:
         """Return the quantile of a probability (0 to 1): the inverse of the distribution function.
 
-        A word or a number of `values`, or a number, with its unit as text if it has one.
+        The result is a word, a number, or a number with a unit as text.
         """
         # choice: the value at whose step the distribution function passes the probability
         if self.kind == "choice":
@@ -108,13 +109,15 @@ class DistributionSection(Section):
         low, high = self._bounds
         if self.kind == "uniform":
             return self._with_unit(low + probability * (high - low))
-        # normal or lognormal: between the bounds is a part of the distribution without bounds
+        # normal or lognormal: the probability of the same number without bounds lies between those
+        # of both bounds
         below_low, below_high = self._probabilities
-        in_whole = below_low + probability * (below_high - below_low)
+        without_bounds = below_low + probability * (below_high - below_low)
         # not 0 or 1, whose quantiles are infinite
-        in_whole = min(max(in_whole, nextafter(0, 1)), nextafter(1, 0))
+        without_bounds = min(max(without_bounds, nextafter(0, 1)), nextafter(1, 0))
+        # of the number or, if it is lognormal, of its logarithm
         centre, width = self._normal
-        x = NormalDist(centre, width).inv_cdf(in_whole)
+        x = NormalDist(centre, width).inv_cdf(without_bounds)
         value = np.exp(x) if self.kind == "lognormal" else x
         return self._with_unit(float(np.clip(value, low, high)))
 

@@ -63,7 +63,7 @@ class Interval:
         return Interval.between(function(self.low), function(self.high))
 
     def hull(self, *values: Any) -> "Interval":
-        """Return the smallest intervals that contain some values, whatever this interval is."""
+        """Return the smallest intervals that contain some values; this interval is not used."""
         return Interval.between(reduce(np.minimum, values), reduce(np.maximum, values))
 
     def unless(
@@ -94,6 +94,7 @@ def _multiply(a: Interval, b: Interval) -> Interval:
 
 def _inverse(a: Interval) -> Interval:
     """Return all inverses: everything if 0 is inside, a half line if 0 is an end."""
+    # 1/x falls, so that the upper bound gives the lower one
     inverse = Interval(1 / a.high, 1 / a.low).unless(a.contains(0.0))
     inverse = inverse.unless((a.low == 0) & (a.high > 0), high=np.inf, low=0.0)
     return inverse.unless((a.high == 0) & (a.low < 0), low=-np.inf, high=0.0)
@@ -108,10 +109,11 @@ def _power(a: Interval, p: Interval) -> Interval:
 
     A negative x has powers with integer n alone.
     """
-    # an exponent that varies: NumPy has no real power of a negative number with a broken one
+    # an exponent that varies: x**n = exp(n log x), since NumPy has no power of a negative number
+    # with an exponent that is no integer
     if p.low.ndim or p.low != p.high:
         return _exp(_multiply(p, _log(a)))
-    # a number as the exponent: one that is no integer has powers of numbers >= 0 alone
+    # a single number as the exponent: if it is no integer, only numbers >= 0 have a power
     n = float(p.low)
     if not n.is_integer() or abs(n) > 1e9:
         return _power_positive(Interval(np.maximum(a.low, 0.0), a.high), n)
@@ -186,6 +188,7 @@ def _sign(a: Interval) -> Interval:
 
 def _arctan2(y: Interval, x: Interval) -> Interval:
     """Return all angles of points (x, y): all from -pi to pi where the angle jumps."""
+    # where the angle does not jump, its bounds are at corners of the box
     angles = y.hull(*(np.arctan2(v, u) for v in (y.low, y.high) for u in (x.low, x.high)))
     return angles.unless(_on_cut(y, x), -np.pi, np.pi)
 

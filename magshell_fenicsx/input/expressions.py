@@ -79,7 +79,7 @@ def _power(x: Any, p: Any) -> Partials:
 
     def term(factor: Any, exponent: Any) -> Any:
         """Return factor x**exponent."""
-        # Not 0/0, for instance of x**1 at 0.
+        # at x = 0 the power may be infinite: with a factor of 0 the term is 0, not nan
         return np.where(factor == 0, 0.0, factor * np.power(x, exponent))
 
     value, log = np.power(x, p), np.log(x)
@@ -161,7 +161,8 @@ class FormulaFunction:
     Attributes
     ----------
     steps
-        The program that evaluates the formula, see `_without_repetition`.
+        The program that evaluates the formula: step i makes value i from a number, a name, or a
+        function of earlier values.
     """
 
     steps: _Program
@@ -182,7 +183,8 @@ class FormulaFunction:
             (n,) bound of the variation of the first derivatives within a box, each times the side
             of the box, summed.
         """
-        # a formula without a variable is a number
+        # in each box the interval of all values, and the intervals of the slopes by x, y and z; a
+        # formula without a variable is a number
         enclosure, n = _evaluate(self.steps, *Enclosure.coordinates(low, high)), len(low)
         if not isinstance(enclosure, Enclosure):
             return np.full(n, enclosure), np.full(n, enclosure), np.zeros(n)
@@ -223,8 +225,9 @@ class FormulaGroup:
     def bounds(self, low: Array, high: Array) -> tuple[Array, ...]:
         """Return least values, largest values and variations, (n, formulas) each, in boxes.
 
-        The boxes lie between corners (n, 3), see `FormulaFunction.bounds`. In another frame they
-        are replaced by boxes along its axes that contain them.
+        A variation bounds by how much the first derivatives vary within a box, times its sides. The
+        boxes lie between corners (n, 3). If the formulas have another frame, boxes along its axes
+        that contain them take their place.
         """
         # in another frame: the box along the formulas' axes that contains the rotated box
         if self.frame is not None:
@@ -239,7 +242,13 @@ def formula_group(
 ) -> FormulaGroup | None:
     """Return the group of those of some functions that are formulas of a case; None without any.
 
-    `frame` and `length` are those of `FormulaGroup`.
+    Parameters
+    ----------
+    frame
+        Rotation (3, 3) whose rows are the axes of the frame of the places, in the formulas' frame;
+        None if the frames are the same.
+    length
+        Unit of the places in the formulas' unit of length.
     """
     formulas = [f for f in functions if isinstance(f, FormulaFunction)]
     return FormulaGroup(formulas, frame, length) if formulas else None
@@ -340,12 +349,12 @@ def _is_allowed(node: ast.AST, *, is_called: bool) -> bool:
 def _without_repetition(steps: list[_Step]) -> _Program:
     """Return a program that computes repeated parts of a formula once.
 
-    Formulas of weights of points repeat themselves.
+    Formulas that are made of many weighted points, for example, repeat the same parts.
 
     Parameters
     ----------
     steps
-        Steps of a stack machine, see `_steps`.
+        Steps of a stack machine: a function with its number of arguments, a number, or a name.
 
     Returns
     -------
@@ -488,6 +497,10 @@ class FormulaVectors:
         Factor of all values.
     vectors
         Whether components are those of a vector in the formulas' frame.
+    by_formula
+        Always true: cells get polynomials with the moments of the formulas, not values at nodes.
+    formulas
+        Those of the components that are formulas of a case, with the frame and unit of the places.
     """
 
     by_formula: ClassVar[bool] = True
@@ -516,6 +529,8 @@ class InwardPressure:
     ----------
     pressure
         The pressure, as a vector of one component.
+    by_formula, formulas
+        As of `pressure`: always true, and the formulas in it with their frame and unit of length.
     """
 
     by_formula: ClassVar[bool] = True

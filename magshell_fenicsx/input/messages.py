@@ -212,9 +212,10 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
 def _tag_problem(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
     """Return a message about a wrong key that chooses a section, such as `kind`."""
     keys = location[:-1] if isinstance(location[-1], int) else location
-    # the key of the union; in a list of sections, the key of the list
+    # the field with the union; in a list of sections, that of the list
     _, field_of_keys = _section_at(keys, source.data, case)
     field = field_of_keys or case.model_fields[str(location[0])]
+    # the members of the union that a key chooses; the tag in the case, and those that are allowed
     sections = [m for m in _models(field.annotation) if _tag_key([m])]
     tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in sections for tag in _tags(m))
     problem = "is missing" if tag is None else shown_value(tag)
@@ -340,8 +341,9 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 def _example(value: Any, location: Location, data: Any, case: type[BaseModel]) -> str:
     """Return the begin of a mapping, such as "ball: ...", as an example in a message.
 
-    `value` is a word or a list of words that a case has in place of the mapping: if it is a name,
-    it is the first key of the example. The type of the key says which words are allowed otherwise.
+    `value` is what a case has in place of the mapping, such as a word or a list of words. If there
+    is a name in it, the example begins with this as its key. If not, the first key comes from the
+    type of the mapping's keys, or is "NAME".
     """
     _, field = _section_at(location, data, case)
     parts_of_annotation = _nested_annotations(field.annotation if field else None)
@@ -379,7 +381,8 @@ def _section_at(
     case
         Class of the case.
     """
-    # `sections` may be at the present place; `is_name`: whether the next key is a user's name
+    # `section` is the class at the present place, `sections` are those that may be there by the
+    # annotation; `is_name`: whether the next key is a user's name
     section, field, sections, is_name = case, None, list[type[BaseModel]](), False
     for key in location:
         # the data at the key

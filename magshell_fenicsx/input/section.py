@@ -95,6 +95,7 @@ def _quantity(unit: str) -> Any:
     """
 
     def convert(value: Any) -> float:
+        """Return the number of a text in `unit`; refuse a bare number."""
         if not isinstance(value, str):
             raise ValueError(f'needs a unit, for example "{_example(unit)}"')
         return _converted(value, unit)
@@ -179,6 +180,7 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
     """
 
     def convert(value: Any) -> Any:
+        """Return the number of a text in `unit`, or the size of a unit; keep any other value."""
         if isinstance(value, bool) or not isinstance(value, str):
             return value
         return _converted(f"1 {value}" if bare else value, unit)
@@ -250,7 +252,7 @@ def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
     metadata
         Annotations that pydantic keeps apart from the type, such as validators.
     """
-    # metadata of this type; then the types within it, such as the items of a list
+    # validators of this type itself; then the types within it, such as the items of a list
     validators = (validator for validator in metadata if isinstance(validator, WithUnit))
     if any(validator.unit == "metre" for validator in validators):
         return True
@@ -386,9 +388,10 @@ class ChosenByKey:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """Return a tagged union of the sections: each is validated as `LazyValidation` says.
+        """Return a tagged union of the sections, in which `key` has the tag.
 
-        Former values of the key are replaced before validation.
+        The validator of a section is built when a case has it. Former values of the key are
+        replaced before validation.
         """
         choices = {
             tag: handler.generate_schema(Annotated[section, LazyValidation(section)])
@@ -567,8 +570,9 @@ def over_size(unit: Unit) -> OverUnit:
         if not isinstance(value, str):
             return value
         value_in_unit = in_units(unit.text)(value)
+        # without sizes the shell is wrong, and its own message says so: any number will do
         if info.context and "given" not in info.context:
-            return 1.0  # the shell is wrong, and its own message says so: any number will do
+            return 1.0
         sizes = (info.context or {}).get("given")
         size = unit.size(sizes) if sizes else nan
         if isnan(size):

@@ -183,7 +183,8 @@ def _note_places(node: yaml.Node, location: Location, source: Source) -> None:
 def override(source: Source, assignment: str) -> None:
     """Apply a setting "key.path=value" of the command line to the data of a case.
 
-    A setting of a key also removes the key beside it that it replaces, see `REPLACED_KEYS`.
+    A setting of a key also removes the key beside it that it replaces: shell.imperfections replaces
+    shell.defect.
 
     Raises
     ------
@@ -201,8 +202,8 @@ def override(source: Source, assignment: str) -> None:
     setting_node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
     _note_places(setting_node or yaml.ScalarNode("", ""), (), setting)
     section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
-    # a replaced key that the file has is removed; one that another setting gave stays, and both
-    # are refused together later
+    # a replaced key that the file has is removed. One that another setting gave stays, and is later
+    # refused together with this key
     replaced_key = REPLACED_KEYS.get(location, "")
     place_of_replaced_key = source.places.get((*location[:-1], replaced_key), "--set")
     if not place_of_replaced_key.startswith("--set"):

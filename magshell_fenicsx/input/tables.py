@@ -102,7 +102,7 @@ def read_rows(file: Path, files: Files) -> TableRows:
     """
     cells = _cells(file, files)
     columns, units = _by_name(cells)
-    if cells.word:
+    if cells.word:  # a cell has text in place of a number
         raise TableError(cells.word)
     lengths = {column.shape for column in columns.values()}
     if len(lengths) > 1 or any(len(shape) != 1 for shape in lengths):
@@ -270,14 +270,15 @@ def _name_and_unit(header: str) -> tuple[str, str | None]:
 def _csv_cells(text: str) -> _TableCells:
     """Return the cells of a CSV file from its text, as numbers.
 
-    Text in a cell is noted, see `_TableCells.word`.
+    A cell with text in place of a number becomes nan, and the first one gives the message `word` of
+    the result.
 
     Raises
     ------
     TableError
         If a column occurs twice, there are no rows, or a row has another number of cells.
     """
-    header, begin = _header(text)
+    header, begin = _header(text)  # the line with the names, and its number
     separator, names = _separator(header), _names(header)
     _refuse_double(names)
     # all cells, row by row, and the line of each row; an array takes less memory than a list, and

@@ -272,7 +272,8 @@ class Grading:
             sizes, max_sizes, min_sizes = (
                 self._size_bound(centres, factor * radius) for factor in (0.0, 1.0, -1.0)
             )
-            # over `PER_AREA`; triangles near small ones take the smaller size
+            # number of triangles, over `PER_AREA`: each takes the least size nearby, since sizes
+            # grow and triangles do not overshoot them
             triangles = area / self._size_bound(centres, -SIZE_SAMPLING_DISTANCE * sizes) ** 2
             # the number of triangles in a cell lies between bounds, by the bounds of its size
             uncertainty = area / min_sizes**2 - area / max_sizes**2
@@ -288,9 +289,9 @@ class Grading:
         return PER_AREA * total + along_thin_strip
 
     def _size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the element sizes near points x (n, 2), as `Feature.size_bound`.
+        """Return bounds (n,) of the element sizes within distances (n,) of points x (n, 2).
 
-        Positive distances (n,) give upper bounds, negative ones lower bounds.
+        Positive distances give upper bounds, negative ones lower bounds, zero the sizes themselves.
         """
         sizes = np.full(len(x), self.largest)
         for feature in self.features:

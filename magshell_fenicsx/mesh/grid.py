@@ -140,7 +140,7 @@ class Grid:
 
         None if there is no straight line so near.
         """
-        lines = self._straight_lines(axis)
+        lines = self._straight_lines(axis)  # fixed lines and both ends
         nearest = float(lines[np.abs(lines - x).argmin()])
         rounding = CHART_TOLERANCE * (self.high[axis] - self.low[axis])
         min_distance = max(rounding, MIN_VERTEX_DISTANCE * self.size_at(axis, x))
@@ -241,9 +241,9 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         If two points take one vertex, or one would move a straight line.
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
-    # numbers of a vertex -> the first point that takes it
+    # (i, j) of a vertex -> name and place of the first point that takes it
     point_of_vertex = dict[tuple[int, int], tuple[str, Array]]()
-    numbers = grid.vertices_of(places)
+    vertex_of_point = grid.vertices_of(places)  # (points, 2) numbers i and j
 
     def shortest(difference: Array) -> Array:
         """Return a difference (2,) of places; across glued ends the shorter way counts."""
@@ -251,7 +251,7 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         return np.asarray(difference - whole_turns)
 
     for number, (name, place) in enumerate(points.items()):
-        i, j = int(numbers[number, 0]), int(numbers[number, 1])
+        i, j = int(vertex_of_point[number, 0]), int(vertex_of_point[number, 1])
         first_name, first_place = point_of_vertex.setdefault((i, j), (name, place))
         offset = shortest(place - vertices[i, j])  # by which the vertex is moved
         distance = shortest(place - first_place)

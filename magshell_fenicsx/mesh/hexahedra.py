@@ -122,7 +122,8 @@ def _halved_edges(patch: PatchMesh, vertices: Numbers, sides: Numbers) -> dict[s
         (s, 2) new numbers of the vertices of each side, the lower one first.
     """
     first_side_node = len(vertices)
-    # a side has three nodes between its vertices, see `_node_numbers`: + 1 is the middle one
+    # three nodes between the vertices of each side have the numbers after those of all vertices,
+    # side by side: the second of the three is the middle
     middle_of_side = {
         (int(sides[n, 0]), int(sides[n, 1])): first_side_node + 3 * n + 1 for n in range(len(sides))
     }
@@ -189,8 +190,9 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
     mean cosine between m and these normals. Each cell's normal is weighted by the cell's angle at
     the corner. This is exact between two faces, and between three that are normal to each other.
 
-    At other nodes of a cell, the offset is the cell's normal there plus a difference. The
-    difference is known at the four corners and interpolated bilinearly between them.
+    At a corner this vector differs from the normal of a cell there. At the other nodes of the cell
+    the offset is the cell's normal plus a difference that is interpolated bilinearly between the
+    differences at its four corners.
 
     Parameters
     ----------
@@ -373,11 +375,7 @@ def sweep(
         On every rank, if the body overlaps itself.
     """
     quads = split(patch)
-    # where the layers begin and end, from 0 inside to 1 outside
-    bounds = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
-    # heights of the levels: the begin of the first layer, then the middle and end of each layer
-    middles_and_ends = [((a + b) / 2, b) for a, b in pairwise(bounds)]
-    heights = np.concatenate([bounds[:1], *middles_and_ends])
+    bounds, heights = _bounds_and_levels(layers)
     factors = np.ones(len(quads.places)) if factor is None else factor(quads.places)
     thickness = h * factors
     # distance of each level from the mid-surface, (nodes of it, levels)
@@ -408,6 +406,24 @@ def sweep(
         thickness=thickness[node],
         w0=w0,
     )
+
+
+def _bounds_and_levels(layers: int | Sequence[float]) -> tuple[Array, Array]:
+    """Return where layers begin and end, and the heights of all levels of nodes.
+
+    Both are fractions of the thickness, from 0 inside to 1 outside. The levels are the begin of the
+    first layer, then the middle and the end of each layer.
+
+    Parameters
+    ----------
+    layers
+        Number of layers of equal height, or where they begin and end.
+    """
+    bounds: Array = np.array(layers)
+    if isinstance(layers, int):
+        bounds = np.linspace(0, 1, layers + 1, dtype=np.float64)
+    middles_and_ends = [((a + b) / 2, b) for a, b in pairwise(bounds)]
+    return bounds, np.concatenate([bounds[:1], *middles_and_ends])
 
 
 def _normal_at(x: Array, quads: Quadrilaterals) -> Array:

@@ -245,6 +245,7 @@ class Midsurface:
 
         None for a T-junction.
         """
+        # masks: whether each triangle is on the first and on the second edge; None stays None
         return [
             masks and (1.0 * masks[0] - 1.0 * masks[1])[self._original_cells]
             for masks in self._patch.joints
@@ -257,7 +258,10 @@ class Midsurface:
 
     @cached_property
     def source_triangles(self) -> NDArray[np.int64]:
-        """This rank's cells among those of a program, see `PatchMesh.source_triangles`."""
+        """This rank's cells among those of a program, (cells, 2).
+
+        They are the number of each, and 1 where its orientation is reversed.
+        """
         assert self._patch.source_triangles is not None
         return self._patch.source_triangles[self._original_cells]
 

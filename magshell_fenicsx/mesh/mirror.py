@@ -329,9 +329,10 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     first_node = np.full(len(patch.nodes), -1, dtype=np.int64)
     first_node[representative[used][::-1]] = np.arange(len(used))[::-1]
     edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
-    sides = used[directed_sides(cells)]  # in old numbers
+    # sides of one triangle alone, in old numbers and then in the new numbers of vertices
+    sides = used[directed_sides(cells)]
     border = border_pairs(first_node[representative[sides]])
-    # drops sides of edges in the other half
+    # of each edge the sides in this half stay
     edges = on_border(edges, border)
     # border sides without a name are in the plane
     named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}

@@ -60,7 +60,8 @@ LINE_TYPES = ("Line 2", "Line 3", "Line 4")
 def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
     """Return triangles (m, 3 | 6 | 10) with one orientation in each connected component.
 
-    It is the orientation that the larger part of the component's area has, see `_is_reversed`.
+    It is the orientation that the larger part of the component's area has. If both parts are equal,
+    it is the one whose normals point upwards in the mean.
 
     Parameters
     ----------
@@ -81,7 +82,8 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     # neighbours that agree run through their edge in opposite directions
     agree = edges[side, 0] != edges[opposite_side, 0]
     m = len(cells)
-    cell, neighbour = side % m, opposite_side % m  # see the order of `directed_sides`
+    # side n is one of triangle n % m: first sides of all triangles come first, then second, third
+    cell, neighbour = side % m, opposite_side % m
     # in the graph each triangle stands twice, as it is (i) and reversed (i + m); orientations of
     # neighbours that agree are joined. An orientable component then makes two separate parts
     rows = np.concatenate([cell, cell + m])
@@ -147,9 +149,10 @@ def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.
     """Return whether a component shall have the orientation opposite to its first triangle's.
 
     The orientation with the larger area is taken. If both areas are equal, it is the one in which
-    the sum of all normals points upwards. If that is zero upwards, it points along e2; then along
-    e1; and at last out of the volume. The numbers of triangles never decide, as they would make
-    the orientation depend on the mesh.
+    the sum of all normals points upwards, along e3. If the component of the sum along e3 is zero,
+    that along e2 decides, then that along e1, and at last whether the normals point out of the
+    volume. The numbers of triangles never decide, as they would make the orientation depend on the
+    mesh.
 
     Parameters
     ----------
@@ -359,10 +362,11 @@ def read_msh(
 def _with_points_of_shells(
     file: MeshFile, patch: PatchMesh, points: Mapping[str, Array], held_edges: Collection[str]
 ) -> PatchMesh:
-    """Return the triangulation of several shells with named points, as `read_msh` for a file.
+    """Return the triangulation of several shells with a vertex for each named point.
 
-    A point that belongs to a shell keeps the vertex of this shell, as another shell may have a
-    vertex at the same place. So do other names of the same place. All others take the vertex there.
+    A point that a shell itself has keeps the vertex of this shell, as another shell may have a
+    vertex at the same place. Other names of the same place get this vertex too. All other points
+    take the vertex that is at their place.
 
     Parameters
     ----------
@@ -402,7 +406,8 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
     """
     triangles = file.content()
     nodes, cells, edges = _without_unused_nodes(file, triangles)
-    # take T-junctions apart; copies of nodes there follow the nodes
+    # take T-junctions apart. `origin` is the old node of each node: copies at T-junctions follow
+    # the old nodes. Each T-junction has a name, the pairs of its edge, and its supporting triangles
     first_copy = len(nodes)
     origin, cells, t_junctions = separate_sheets(nodes, cells)
     nodes = nodes[origin]

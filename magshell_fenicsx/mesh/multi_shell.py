@@ -253,12 +253,7 @@ def union_of_shells(
         cells.append(patch.cells + first_node)
         glued = np.arange(node_count) if patch.representative is None else patch.representative
         representatives.append(glued + first_node)
-        # edges: those in a symmetry plane may be one edge of all shells
-        for name, pairs in patch.edges.items():
-            is_common = one_symmetry_edge and name in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
-            name_of_all = name if is_common else f"{member.name}_{name}"
-            earlier_pairs = [edges[name]] if is_common and name in edges else []
-            edges[name_of_all] = np.concatenate([*earlier_pairs, pairs + first_node])
+        _add_edges(edges, member.name, patch, first_node, one_symmetry_edge=one_symmetry_edge)
         for name in patch.points:
             # a shell's pole is a point of all shells even if the case does not name it
             if name in ("pole", *member.points):
@@ -286,6 +281,34 @@ def union_of_shells(
         source_triangles,
         shells=tuple(member.name for member in members),
     )
+
+
+def _add_edges(
+    edges: dict[str, NDArray[np.int64]],
+    shell: str,
+    patch: PatchMesh,
+    first_node: int,
+    *,
+    one_symmetry_edge: bool,
+) -> None:
+    """Add the edges of a shell to those of all shells, under names that begin with the shell's.
+
+    Parameters
+    ----------
+    edges
+        Name -> pairs of vertices, of all shells before this one.
+    shell, patch
+        Name and triangulation of the shell.
+    first_node
+        Number of its first node among those of all shells.
+    one_symmetry_edge
+        Whether its edges in a symmetry plane are appended to the one edge of all shells there.
+    """
+    for name, pairs in patch.edges.items():
+        is_common = one_symmetry_edge and name in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
+        name_of_all = name if is_common else f"{shell}_{name}"
+        earlier_pairs = [edges[name]] if is_common and name in edges else []
+        edges[name_of_all] = np.concatenate([*earlier_pairs, pairs + first_node])
 
 
 def _with_shell_number(coordinates: Array, number: int, embedding: MultiShellEmbedding) -> Array:
@@ -384,9 +407,13 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     for name in edges:
         if name not in patch.edges:
             raise MeshError(f"{key}: {name}: there is no such edge, only {', '.join(patch.edges)}")
-    edge_places = [patch.nodes[np.unique(patch.edges[name]), :3] for name in edges]
-    patch, gap_to_first = _with_vertices_on_edge(patch, edges[0], edge_places[1])
-    patch, gap_to_second = _with_vertices_on_edge(patch, edges[1], edge_places[0])
+    # each edge gets vertices where the other one has some; a gap is the largest distance of these
+    # from the edge, with its place
+    places_of_first, places_of_second = (
+        patch.nodes[np.unique(patch.edges[name]), :3] for name in edges
+    )
+    patch, gap_to_first = _with_vertices_on_edge(patch, edges[0], targets=places_of_second)
+    patch, gap_to_second = _with_vertices_on_edge(patch, edges[1], targets=places_of_first)
     gap, gap_place = max(gap_to_first, gap_to_second, key=lambda gap_and_place: gap_and_place[0])
     if gap > MEETING_TOLERANCE * float(np.ptp(patch.nodes[:, :3], axis=0).max()):
         raise MeshError(
@@ -394,20 +421,7 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
             "over R: move one of the shells, or make both edges as long"
         )
     assert patch.representative is not None
-    first, second = (np.unique(patch.edges[name]) for name in edges)
-    places = patch.nodes[:, :3]
-    distances = np.linalg.norm(places[second][:, None] - places[first][None], axis=2)
-    nearest = distances.argmin(axis=1)
-    # gluing needs exactly one vertex of the second edge for each of the first
-    if len(np.unique(nearest)) != len(first):
-        near_pair = _nearest_pair_text(places[first], places[second])
-        raise MeshError(
-            f"{key}: vertices of {' and '.join(edges)} nearly meet, {near_pair}, over R: "
-            "give both shells the same mesh.size"
-        )
-    # number of the vertex -> number after gluing
-    glued_to = np.arange(len(patch.representative))
-    glued_to[second] = first[nearest]
+    glued_to = _vertices_after_gluing(patch, edges, key)
     glued_patch = replace(
         patch,
         edges={name: glued_to[pairs] for name, pairs in patch.edges.items()},
@@ -421,6 +435,33 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
             "turn one of the shells over"
         ) from None
     return glued_patch
+
+
+def _vertices_after_gluing(patch: PatchMesh, edges: tuple[str, str], key: str) -> NDArray[np.int64]:
+    """Return the number that each vertex has after the second edge is glued to the first.
+
+    A vertex of the second edge gets that of the nearest vertex of the first.
+
+    Raises
+    ------
+    MeshError
+        If there is not exactly one vertex of the second edge for each of the first; the message
+        begins with the key.
+    """
+    assert patch.representative is not None
+    first, second = (np.unique(patch.edges[name]) for name in edges)
+    places = patch.nodes[:, :3]
+    distances = np.linalg.norm(places[second][:, None] - places[first][None], axis=2)
+    nearest = distances.argmin(axis=1)
+    if len(np.unique(nearest)) != len(first):
+        near_pair = _nearest_pair_text(places[first], places[second])
+        raise MeshError(
+            f"{key}: vertices of {' and '.join(edges)} nearly meet, {near_pair}, over R: "
+            "give both shells the same mesh.size"
+        )
+    glued_to = np.arange(len(patch.representative))
+    glued_to[second] = first[nearest]
+    return glued_to
 
 
 def _nearest_pair_text(first: Array, second: Array) -> str:
@@ -513,6 +554,7 @@ def _with_divided_triangle(
     """
     assert patch.representative is not None
     assert patch.source_triangles is not None
+    # node numbers of each new triangle, coordinates of the new nodes, numbers along the side
     new_cells, new_nodes, side_nodes = _parts_of_triangle(patch, cell, side, cuts)
     first_new_node = len(patch.nodes)
     nodes = np.concatenate([patch.nodes, new_nodes])
@@ -566,16 +608,12 @@ def _parts_of_triangle(
     side_nodes
         Nodes along the side: its ends, and those at the cuts between.
     """
-    import basix  # slow to import, and not needed to read a case
-    from dolfinx import mesh
+    from dolfinx import mesh  # slow to import, and not needed to read a case
     from dolfinx.cpp.io import perm_gmsh
-
-    from magshell_fenicsx.mesh.midsurface import ORDERS
 
     # a cell's number of nodes, and the vertices (0 to 2) at the ends of the side
     count, (i, j) = patch.cells.shape[1], TRIANGLE_SIDES[side]
-    family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
-    points = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant).points
+    points = _equispaced_element(count).points
     cut_parameters = np.array([0.0, *cuts, 1.0])
     X = REFERENCE_VERTICES[i] + cut_parameters[:, None] * (
         REFERENCE_VERTICES[j] - REFERENCE_VERTICES[i]
@@ -613,18 +651,24 @@ def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Arra
 
     They are interpolated between the nodes of the cell, by its polynomials.
     """
-    import basix  # slow to import, and not needed to read a case
-    from dolfinx import mesh
+    from dolfinx import mesh  # slow to import, and not needed to read a case
     from dolfinx.cpp.io import perm_gmsh
+
+    count = patch.cells.shape[1]
+    # shape functions (n, nodes), in dolfinx's order of the nodes
+    table = _equispaced_element(count).tabulate(0, X)[0, :, :, 0]
+    dolfinx_cells = patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]
+    return np.asarray(np.einsum("nk,nkd->nd", table, patch.nodes[dolfinx_cells]))
+
+
+def _equispaced_element(count: int) -> Any:
+    """Return basix's Lagrange element with `count` equispaced nodes (3, 6 or 10) on a triangle."""
+    import basix  # slow to import, and not needed to read a case
 
     from magshell_fenicsx.mesh.midsurface import ORDERS
 
-    count = patch.cells.shape[1]
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
-    element = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
-    table = element.tabulate(0, X)[0, :, :, 0]
-    dolfinx_cells = patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]
-    return np.asarray(np.einsum("nk,nkd->nd", table, patch.nodes[dolfinx_cells]))
+    return basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
 
 
 def _cells_on_edge(patch: PatchMesh, edge: str) -> NDArray[np.bool_]:
@@ -649,16 +693,14 @@ def _with_nodes_per_cell(patch: PatchMesh, count: int) -> PatchMesh:
     """
     if patch.cells.shape[1] == count:
         return patch
-    import basix  # slow to import, and not needed to read a case
-    from dolfinx import mesh
+    from dolfinx import mesh  # slow to import, and not needed to read a case
     from dolfinx.cpp.io import perm_gmsh
 
-    from magshell_fenicsx.mesh.midsurface import ORDERS, at_reference_points
+    from magshell_fenicsx.mesh.midsurface import at_reference_points
 
-    family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
-    element = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
     # coordinates (m, new nodes of a cell, d) at the nodes that follow the three vertices
-    places = at_reference_points(patch.nodes, patch.cells, element.points[3:])
+    new_points = _equispaced_element(count).points[3:]
+    places = at_reference_points(patch.nodes, patch.cells, new_points)
     first_new = len(patch.nodes)
     new_numbers = first_new + np.arange(places.shape[0] * places.shape[1]).reshape(places.shape[:2])
     cells = np.empty((len(patch.cells), count), dtype=np.int64)

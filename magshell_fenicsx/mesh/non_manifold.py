@@ -60,6 +60,7 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         Name -> an edge at which a sheet was taken off.
     """
     m = len(cells)
+    # vertices of each edge, the edge of each side of a triangle, and the triangles of each edge
     pairs, edge_of_side, triangle_counts = np.unique(
         np.sort(directed_sides(cells), axis=1), axis=0, return_inverse=True, return_counts=True
     )
@@ -73,7 +74,8 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
     ending_cells = list[tuple[int, int]]()  # edges, and triangles whose sheet ends there
     for edge in np.flatnonzero(triangle_counts > 1):
         sides = sides_by_edge[first_of_edge[edge] : first_of_edge[edge + 1]]
-        cells_at_edge = [int(side) % m for side in sides]  # see the order of `directed_sides`
+        # side n is one of triangle n % m: all first sides come first, then second, then third ones
+        cells_at_edge = [int(side) % m for side in sides]
         if len(cells_at_edge) == 2:
             neighbours.append((cells_at_edge[0], cells_at_edge[1]))
             continue
@@ -89,17 +91,30 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
     sheets = _sheet_numbers(m, neighbours)
     t_junctions = dict[str, TJunction]()
     for sheet in dict.fromkeys(sheets[cell] for _, cell in ending_cells):
+        ends_of_sheet = [(edge, cell) for edge, cell in ending_cells if sheets[cell] == sheet]
         end_pairs, supports = list[list[int]](), np.zeros(m, dtype=bool)
-        for edge, cell in ending_cells:
-            if sheets[cell] == sheet:
-                # the side of the triangle at the edge, in its new nodes
-                corners = [int(corner) for corner in cells[cell, :3]]
-                end_pairs.append([corner for corner in corners if origin[corner] in pairs[edge]])
-                supports[list(supporting_cells[edge])] = True
-        number = len(t_junctions) + 1
-        name = JUNCTION_NAME if number == 1 else f"{JUNCTION_NAME}_{number}"
-        t_junctions[name] = TJunction(np.array(end_pairs), supports)
+        for edge, cell in ends_of_sheet:
+            end_pairs.append(_side_at_edge(cells[cell], pairs[edge], origin))
+            supports[list(supporting_cells[edge])] = True
+        suffix = f"_{len(t_junctions) + 1}" if t_junctions else ""  # the first one has no number
+        t_junctions[JUNCTION_NAME + suffix] = TJunction(np.array(end_pairs), supports)
     return origin, cells, t_junctions
+
+
+def _side_at_edge(cell: Cells, edge: Cells, origin: Cells) -> list[int]:
+    """Return the two vertices of a triangle at an edge, as new nodes.
+
+    Parameters
+    ----------
+    cell
+        (3 | 6 | 10,) new nodes of the triangle.
+    edge
+        (2,) old vertices of the edge.
+    origin
+        The old node of each new one.
+    """
+    corners = [int(corner) for corner in cell[:3]]
+    return [corner for corner in corners if origin[corner] in edge]
 
 
 def _flattest_pair(

@@ -92,7 +92,7 @@ def fit_scattered(
         # drop the later one of each pair
         places, values = (np.delete(f, duplicates.max(axis=1), axis=0) for f in (places, values))
         tree = scipy.spatial.cKDTree(places)
-    # the patches, each with its places and values
+    # the patches are balls that cover the surface, each with the places and values in it
     centres, radii = _covering_balls(tree, np.vstack([cover, places]))
     patches = list[tuple[_PatchPlaces, Array]]()
     for centre, numbers in zip(centres, tree.query_ball_point(centres, radii), strict=True):
@@ -114,7 +114,8 @@ def _covering_balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array,
     The balls with `INNER_RADIUS` of these radii cover all places of `cover` (m, 3).
     """
     # distances of the nearest value, and of the last one that a patch needs
-    nearest, farthest = tree.query(cover, [1, min(MIN_VALUES, tree.n)])[0].T
+    distances, _ = tree.query(cover, [1, min(MIN_VALUES, tree.n)])
+    nearest, farthest = distances.T
     radii = np.maximum(farthest, HOLE_RADIUS * nearest) * (1 + RADIUS_MARGIN)
     cover_tree, is_uncovered = scipy.spatial.cKDTree(cover), np.ones(len(cover), dtype=bool)
     centres = []
@@ -226,12 +227,14 @@ class _PatchPlaces:
             candidates = sizes[-1] * SMOOTHINGS
             # (lambdas, modes) part of each mode that a lambda removes
             removed = candidates[:, None] / (candidates[:, None] + sizes)
-            # squares of what is removed, less their mean by noise alone
+            # Mallows' estimate of the risk for each lambda, up to a constant: the squares of what
+            # is removed, less twice the noise that is removed
             risk = removed**2 @ components**2 - 2 * noise**2 * removed.sum(axis=1)
             smoothing = candidates[np.argmin(risk)]
         # coefficients of the kernels; scale^5 is for places over the scale instead of over R
         kernel = modes @ (components / (sizes + smoothing)) * self.scale**5
-        # of the equations K kernel + lambda kernel + P polynomial = values, P polynomial remains
+        # the spline solves (K + lambda) kernel + P polynomial = values, with the kernels K and the
+        # quadratics P at the places: what the kernels leave of the values is P polynomial
         kernel_values = _kernel(self.places, self.places) @ kernel
         remainder = values - kernel_values - smoothing / self.scale**5 * kernel
         quadratics = _quadratics(self.places, self.axes)
@@ -249,8 +252,15 @@ def _estimated_noise(patches: Sequence[tuple[_PatchPlaces, Array]]) -> float:
     patches
         Places of each patch, and its values (n,).
     """
-    sizes = np.concatenate([patch.modes[0] for patch, _ in patches])
-    components = np.concatenate([patch.modes[1].T @ values for patch, values in patches])
+    # eigenvalues of the modes of all patches, and the values in these modes
+    modes_of_patches = [patch.modes for patch, _ in patches]
+    sizes = np.concatenate([eigenvalues for eigenvalues, _ in modes_of_patches])
+    components = np.concatenate(
+        [
+            vectors.T @ values
+            for (_, vectors), (_, values) in zip(modes_of_patches, patches, strict=True)
+        ]
+    )
     candidates = sizes.max() * SMOOTHINGS
     # (lambdas, modes) part of each mode that a lambda removes from the spline
     removed = candidates[:, None] / (candidates[:, None] + sizes)

@@ -120,14 +120,15 @@ class DiscShape:
             return list(occ.intersect(faces, [self._wedge(occ)])[0])
         # a rectangle over y >= 0 that is larger than the disc
         upper = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
-        return list(occ.intersect(faces, [upper])[0])
+        half_faces, _ = occ.intersect(faces, [upper])
+        return list(half_faces)
 
     def _wedge(self, occ: Any) -> tuple[int, int]:
         """Make the triangle between the two sides of the sector, larger than the disc."""
         # its third side is then at twice the radius from the origin
         side = 2 * self.radius / np.cos(pi / (2 * self.waves))
-        ends = [side * self._second_side, np.array([side, 0.0])]
-        corners = [occ.addPoint(*x, 0) for x in (np.zeros(2), ends[1], ends[0])]
+        end_of_second, end_of_first = side * self._second_side, np.array([side, 0.0])
+        corners = [occ.addPoint(*x, 0) for x in (np.zeros(2), end_of_first, end_of_second)]
         lines = [occ.addLine(corners[i], corners[(i + 1) % 3]) for i in range(3)]
         return 2, occ.addPlaneSurface([occ.addCurveLoop(lines)])
 

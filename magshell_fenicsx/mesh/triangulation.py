@@ -60,7 +60,9 @@ def triangulate(
         if not len(overturned_corners):
             break
         size = _halved_at(size, overturned_corners)
-        if attempt == WIDENING_ATTEMPT:  # curves that touch leave cusps: they shall overlap
+        # curves that touch leave cusps between them, in which no triangle has area: wider rims
+        # overlap instead
+        if attempt == WIDENING_ATTEMPT:
             rims = tuple(x + WIDENING * (x - x.mean(axis=0)) for x in shape.rims)
             shape = replace(shape, rims=rims)  # type: ignore[type-var]
     else:
@@ -126,8 +128,8 @@ def _gmsh_mesh(
         raise (element_size.error or MeshError(message)) from None
     finally:
         gmsh.finalize()
-    # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale,
-    # and with it an order of convergence in h; this place reproduces quadratics (Lenoir, SIAM J.
+    # at a curved edge gmsh's inner node is a little off, which costs an order of convergence in the
+    # element size. The place that is taken here is exact for quadratic edges (Lenoir, SIAM J.
     # Numer. Anal. 23, 1986)
     nodes[cells[:, 9]] = nodes[cells[:, 3:9]].sum(axis=1) / 4 - nodes[cells[:, :3]].sum(axis=1) / 6
     return nodes, cells, lines

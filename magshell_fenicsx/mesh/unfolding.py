@@ -237,6 +237,7 @@ def unfold(
     cells = np.concatenate(
         [k * n + (patch.cells[:, mirrored_order] if k % 2 else patch.cells) for k in range(count)]
     )
+    # rows that are equal for nodes that are the same, and the lowest number of those nodes
     keys = unfolding.key(nodes)
     first_of_same = _first_at_same_place(keys)
     glued_to = np.arange(n) if patch.representative is None else patch.representative
@@ -249,26 +250,7 @@ def unfold(
     new_number = np.full(len(nodes), -1, dtype=np.int64)
     new_number[used] = np.arange(len(used))
 
-    def edge_of_copies(name: str, copies: Sequence[int]) -> NDArray[np.int64]:
-        """Return the vertex pairs of an edge of the sector in some copies."""
-        return np.concatenate(
-            [new_number[representative[k * n + patch.edges[name]]] for k in copies]
-        )
-
-    # edges: those between copies vanish, and the outer ends get the names that are given
-    last_copy = count - 1
-    edges = {
-        name: edge_of_copies(name, range(count))
-        for name in patch.edges
-        if name not in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
-    }
-    first_end = edge_of_copies(SYMMETRY_EDGE, [0])
-    # an odd copy is a mirror image, and ends where the sector begins
-    last_end = edge_of_copies(SYMMETRY_EDGE if last_copy % 2 else SECOND_SYMMETRY_EDGE, [last_copy])
-    if end_names == (SYMMETRY_EDGE, SYMMETRY_EDGE):
-        edges[SYMMETRY_EDGE] = np.concatenate([first_end, last_end])
-    else:
-        edges |= dict(zip(end_names, (first_end, last_end), strict=True))
+    edges = _edges_of_copies(patch, new_number[representative], count, end_names)
     is_glued = has_own_nodes or patch.representative is not None
     source_triangles = patch.source_triangles
     if source_triangles is not None:
@@ -288,6 +270,46 @@ def unfold(
             masks and (np.tile(masks[0], count), np.tile(masks[1], count)) for masks in patch.joints
         ),
     )
+
+
+def _edges_of_copies(
+    patch: PatchMesh, vertex_number: NDArray[np.int64], count: int, end_names: tuple[str, str]
+) -> dict[str, NDArray[np.int64]]:
+    """Return the edges of all copies of a sector: name -> pairs of vertices.
+
+    Edges between two copies vanish.
+
+    Parameters
+    ----------
+    patch
+        The triangulation of the sector, with n nodes.
+    vertex_number
+        (count n,) number of the vertex at each node of all copies, in the result.
+    count
+        Number of copies.
+    end_names
+        Names of the edges where the first copy begins and the last one ends.
+    """
+    n = len(patch.nodes)
+
+    def edge_in(name: str, copies: Sequence[int]) -> NDArray[np.int64]:
+        """Return the vertex pairs of an edge of the sector in some copies."""
+        return np.concatenate([vertex_number[k * n + patch.edges[name]] for k in copies])
+
+    last_copy = count - 1
+    edges = {
+        name: edge_in(name, range(count))
+        for name in patch.edges
+        if name not in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
+    }
+    first_end = edge_in(SYMMETRY_EDGE, [0])
+    # an odd copy is a mirror image, and ends where the sector begins
+    last_end = edge_in(SYMMETRY_EDGE if last_copy % 2 else SECOND_SYMMETRY_EDGE, [last_copy])
+    if end_names == (SYMMETRY_EDGE, SYMMETRY_EDGE):
+        edges[SYMMETRY_EDGE] = np.concatenate([first_end, last_end])
+    else:
+        edges |= dict(zip(end_names, (first_end, last_end), strict=True))
+    return edges
 
 
 def _first_at_same_place(keys: Array) -> NDArray[np.int64]:

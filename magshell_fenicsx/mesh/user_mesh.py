@@ -106,7 +106,7 @@ class UserMesh:
         number = np.empty(len(used), dtype=np.int64)
         number[order] = np.arange(len(used))
         places = self._gather_cells(nodes).reshape(-1, 3)[first_index[order]]
-        # edges by dolfinx's global node numbers, and patches by local cells
+        # by name: vertex pairs of an edge in dolfinx's global numbers, and local cells of a patch
         pairs_of_edges = {
             name: self._vertex_pairs(self._entities_of_part(f"edges.{name}", part, facet_tags, 1))
             for name, part in edges.items()

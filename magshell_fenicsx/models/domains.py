@@ -192,9 +192,9 @@ class IntegrationDomain:
     jet
         Function from a field of the placement's space to its value and derivatives.
     covector
-        Covector of an edge, see `kinematics.conormal`.
+        Covector m (2,) of an edge.
     widths
-        h_e of edges between cells and at the boundary, see `edges.two_sided`.
+        h_e, the width of the cells, for edges between cells and for edges at the boundary.
     rule, edge_rule, contact_rule
         Degrees of the quadrature on cells, along edges (None where these are points) and under
         contact.
@@ -316,7 +316,7 @@ class IntegrationDomain:
         With `from_initial` a density on cells counts the displacement from the initial placement.
         On interior edges the density takes pairs of jets, covectors and fields, '+' first.
         """
-        r0 = self.j0
+        r0, (interior_width, boundary_width) = self.j0, self.widths
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
             m = self.covector("+"), self.covector("-")
@@ -324,9 +324,9 @@ class IntegrationDomain:
             sided = [
                 (p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters
             ]
-            return density.function(*pairs, m, self.widths[0], *sided)
+            return density.function(*pairs, m, interior_width, *sided)
         if density.facets is not None:
-            return density.function(r0, u, self.covector, self.widths[1], *density.parameters)
+            return density.function(r0, u, self.covector, boundary_width, *density.parameters)
         return density.function(
             *(self.jets_from_initial(u) if from_initial else (r0, u)), *density.parameters
         )

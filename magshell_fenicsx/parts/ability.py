@@ -140,7 +140,11 @@ class Context:
         return self.steps[: number - 1]
 
     def driven_before(self, number: int) -> set[str]:
-        """Return the amplitudes that steps before the step with a number have driven."""
+        """Return the amplitudes that steps before the step with a number have driven.
+
+        A step drives the amplitude of its name, and perhaps amplitudes of other steps
+        (`load.drives`).
+        """
         return {
             name for step in self.steps_before(number) for name in (step.name, *step.load.drives)
         }

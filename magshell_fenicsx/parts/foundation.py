@@ -95,9 +95,10 @@ class Foundation(Part):
 
         Their amplitudes are the stiffnesses over E h/R².
         """
-        stiffnesses, energies = self._dimensionless(scales), list[OwnTerm]()
+        stiffnesses = self._dimensionless(scales)  # those of "k" and "k_t" that are given
+        energies = list[OwnTerm]()
         factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
-        # a column of results beside the energy, whose density is `reaction`
+        # the springs along the normal also have a column of results, with the density `reaction`
         if "k" in stiffnesses:
             observed = {"foundation_force": reaction}
             energies.append(
@@ -135,10 +136,16 @@ def energy(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Exp
 
 
 def reaction(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
-    """Return the density -u . n0 of the reaction for k = 1, over the unit of the force."""
+    """Return the density k w of the reaction for k = 1, with w = -u . n0.
+
+    `force` is the unit of the force, by which the density is divided; `factor` multiplies k.
+    """
     return -factor * ufl.dot(u.r, kin.normal(r0)) / force
 
 
 def tangential_energy(r0: Jet, u: Jet, factor: "Expr | float" = 1.0) -> "Expr":
-    """Return the energy density k_t |u_t|²/2 of springs in the surface for k_t = 1."""
+    """Return the energy density k_t |u_t|²/2 of springs in the surface for k_t = 1.
+
+    |u_t|² is |u|² - (u . n0)²; `factor` multiplies k_t.
+    """
     return factor * (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

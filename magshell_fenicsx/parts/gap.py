@@ -76,9 +76,9 @@ def thickness_ratio(r0: Jet, u: Jet, natural: Forms | None = None, thins: Expr |
         1 where the shell keeps its volume: the ratio is the undeformed, or natural, area over the
         deformed one, times the natural thickness. 0 where the thickness stays: the ratio is 1.
     """
-    stretch = kin.area_ratio(r0) / kin.area_ratio(r0 + u)
-    stretch = stretch if natural is None else stretch * natural.area * natural.thickness
-    return 1 + thins * (stretch - 1)
+    ratio = kin.area_ratio(r0) / kin.area_ratio(r0 + u)  # undeformed over deformed area
+    ratio = ratio if natural is None else ratio * natural.area * natural.thickness
+    return 1 + thins * (ratio - 1)
 
 
 def thickness_ratio_at_points(
@@ -109,22 +109,24 @@ def thickness_ratio_at_points(
         It is a memo: a value that is computed again where displacement or natural shape have
         changed.
         """
-        # makes of coefficients the value and its derivatives d/ds1, d/ds2, ... at the places
+        # a function: from the coefficients of a field to its value and its derivatives d/ds1,
+        # d/ds2, ... at the places
         jets_of = domain.tables(V, points)
 
         def values() -> Array:
             """Return the ratio (cells * places,) at the present displacement."""
-            # both tangents, whose cross product has the area as its length
+            # (2, cells, places, 3) both tangents, whose cross product has the area as its length
             undeformed_tangents = jets_of(r0.x.array)[1:3]
             deformed_tangents = undeformed_tangents + jets_of(u.x.array)[1:3]
             area0, area = (
                 np.linalg.norm(np.cross(*tangents), axis=-1)
                 for tangents in (undeformed_tangents, deformed_tangents)
             )
-            factor = (
+            # the volume over the undeformed one, which is 1 without growth
+            volume = (
                 natural.volume(undeformed_tangents, points) if natural and natural_values else 1.0
             )
-            return np.asarray(1 + thins * (factor * area0 / area - 1)).ravel()
+            return np.asarray(1 + thins * (volume * area0 / area - 1)).ravel()
 
         return Memo(values, lambda: (r0.x.array, u.x.array, *(natural_values or ())))
 
@@ -165,7 +167,7 @@ def expanded_penalty(
     tuple
         psi, psi' and psi'' at the penetrations s, of the shape of s.
     """
-    value, first, second = penalty(s0, k, soft_penetration)
+    value, first, second = penalty(s0, k, soft_penetration)  # psi, psi' and psi'' at s0
     step = s - s0
     # psi''' is zero where psi'' is constant: without penetration, and beyond the soft one
     third = with_third_order * np.where(

@@ -119,19 +119,9 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
                 _refuse_too_stiff(i, section, context)
-            edge, other = section.edges
-            is_t_junction = other in shells  # `other` is then a shell, and else an edge
-            if section.angle is not None and is_t_junction:
-                raise ValueError(
-                    f"joints.{i}.angle: of an edge on another shell the spring rests as it is "
-                    "placed: leave it out"
-                )
-            if is_t_junction and edge.startswith(f"{other}_"):
-                others = ", ".join(sorted(set(shells) - {other})) or "none"
-                raise ValueError(
-                    f"joints.{i}: {other}: is the shell of the edge itself, which joins nothing; "
-                    f"allowed: {others}"
-                )
+            _, other = section.edges
+            if other in shells:  # an edge on another shell; else `other` is an edge too
+                _refuse_unfit_t_junction(i, section, list(shells))
             # an edge may be joined once; on a shell several edges may be
             for name in section.edges:
                 if name in shells:
@@ -171,6 +161,31 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                 )
             )
         return {"joints": tuple(joints)}
+
+
+def _refuse_unfit_t_junction(number: int, section: JointSection, shells: Sequence[str]) -> None:
+    """Refuse a T-junction, an edge on a shell, with an angle or on the shell of the edge itself.
+
+    `number` is the position of the joint in `joints`, from 0, and `shells` are the names of all
+    shells.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    edge, shell = section.edges
+    if section.angle is not None:
+        raise ValueError(
+            f"joints.{number}.angle: of an edge on another shell the spring rests as it is "
+            "placed: leave it out"
+        )
+    if edge.startswith(f"{shell}_"):
+        others = ", ".join(sorted(set(shells) - {shell})) or "none"
+        raise ValueError(
+            f"joints.{number}: {shell}: is the shell of the edge itself, which joins nothing; "
+            f"allowed: {others}"
+        )
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
@@ -302,13 +317,14 @@ class Creases:
 
         creases, marks_of_cells = list[Joint](), list[Any]()
         for joint, marks_of_joint in zip(joints, midsurface.joints, strict=True):
-            # a rigid joint is an edge as any other; without marks it is not on this mesh
+            # a rigid joint is an edge as any other, and a joint without marks is not on this mesh
             if not (joint.rigid or marks_of_joint is None):
                 creases.append(joint)
                 marks_of_cells.append(marks_of_joint)
         if not creases:
             return None
         count = len(creases)
+        # a field with `count` numbers in each cell
         Q = fem.functionspace(midsurface.mesh, ("DG", 0, (count,)))
         marks = fem.Function(Q, name="joints")
         cells = Q.dofmap.list[:, 0]
@@ -342,8 +358,6 @@ class Creases:
         factor
             Amplitude by which the rest angles have grown, from the placement (0) to their own (1).
         """
-        import ufl
-
         from magshell_fenicsx.models.shell import kinematics as kin
         from magshell_fenicsx.models.shell.edges import fold_angle
 
@@ -359,35 +373,47 @@ class Creases:
             # pairs, one for each side: jets of placement and displacement, and covectors m normal
             # to the edge in the reference plane
             r0, u, m = edge_arguments[:3]
-            # what is summed over joints: energies of springs, and 1 at a joint
-            within_shell, springs, is_joint = density.function(*edge_arguments, **options), 0, 0
-            conormals = zip(r0, m, strict=True)
+            within_shell = density.function(*edge_arguments, **options)
             # undeformed length of the edge over that of the reference, a mean over both sides
-            stretch = sum(kin.conormal(jet, covector)[2] for jet, covector in conormals) / 2
+            stretches = list[Any]()
+            for jet, covector in zip(r0, m, strict=True):
+                *_, stretch_of_side = kin.conormal(jet, covector)
+                stretches.append(stretch_of_side)
+            stretch = sum(stretches) / 2
             # sine and cosine of the angle between the normals: undeformed, and deformed
             undeformed = fold_angle(r0[0], r0[1], m[0])
-            sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+            deformed = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+            # sums over joints: of the energies of springs, and of 1 at a joint
+            springs, is_joint = 0, 0
             for i in range(count):
                 # 1 between the edges of joint i, where the marks are 1 and -1; 0 elsewhere
                 product = plus[i] * minus[i]
                 at_joint = product * (product - 1) / 2
                 # the angle theta_0 at rest: that of the placement, or on the way to the spring's
-                sine_at_rest, cosine_at_rest = undeformed
+                at_rest = undeformed
                 if grow:
-                    sine_at_rest, cosine_at_rest = _sine_and_cosine_at_rest(
-                        undeformed, angle[i], growth * has_angle[i]
-                    )
-                # theta - theta_0 by sine and cosine, without a jump of the angle at 180 degrees
-                rotation = ufl.atan2(
-                    sine * cosine_at_rest - cosine * sine_at_rest,
-                    cosine * cosine_at_rest + sine * sine_at_rest,
-                )
+                    at_rest = _sine_and_cosine_at_rest(undeformed, angle[i], growth * has_angle[i])
+                rotation = _angle_between(at_rest, deformed)  # theta - theta_0
                 springs += at_joint * k[i] / 2 * rotation**2 * stretch
                 is_joint += at_joint
             return (1 - is_joint) * within_shell + springs
 
         added = self.marks, self.stiffness, self.angle, self.has_angle, factor
         return replace(density, function=with_springs, parameters=(*density.parameters, *added))
+
+
+def _angle_between(first: tuple[Any, Any], second: tuple[Any, Any]) -> Any:
+    """Return the difference of two angles, the second less the first, as a UFL expression.
+
+    Each is given by its sine and cosine, so that the difference has no jump at 180 degrees.
+    """
+    import ufl
+
+    (first_sine, first_cosine), (sine, cosine) = first, second
+    return ufl.atan2(
+        sine * first_cosine - cosine * first_sine,
+        cosine * first_cosine + sine * first_sine,
+    )
 
 
 def _sine_and_cosine_at_rest(undeformed: Any, angle: Any, growth: Any) -> tuple[Any, Any]:

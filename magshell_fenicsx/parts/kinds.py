@@ -34,7 +34,8 @@ def section_of(package: str, kind: str) -> type[Section]:
     It is the one class in the file of the kind with this value of the key `kind`.
     """
     module = import_module(f"{__package__}.{package}.{kind}")
-    module_members = (  # without classes that the module imports
+    # what the module itself defines, without what it imports
+    module_members = (
         member
         for member in vars(module).values()
         if getattr(member, "__module__", "") == module.__name__

@@ -172,7 +172,8 @@ class LaminateSection(Section):
         Q = np.array([ply.stiffness[VOIGT_INDICES] for ply in self.plies]) / E
         # integrals of Q, Q z and Q z^2 over the thickness
         stiffnesses = np.array([np.diff(heights**n) @ Q / n for n in (1, 2, 3)])
-        # bounds of A, B and D if all plies were as stiff as the stiffest: rounding is beside these
+        # A, B and D are at most as large as these; much smaller values are rounding, where plies
+        # cancel, and become zero
         largest_values = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
         return np.where(
             np.abs(stiffnesses) <= STIFFNESS_TOLERANCE * largest_values, 0.0, stiffnesses
@@ -181,9 +182,8 @@ class LaminateSection(Section):
     def direction(self, geometry: str) -> Array | None:
         """Return the unit vector (3,) whose part in the surface has the angle 0.
 
-        None stands for the meridians.
-
-        `geometry` is that of the shell, on which the default depends.
+        It is None if the angle 0 is along the meridians. The default depends on the shell's
+        `geometry`.
         """
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
@@ -297,8 +297,8 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
         )
     if section.twists:
         return SymmetryConstraint(reason, mirrors=no_plane)
-    # planes through e3 along and across a vector may be planes of symmetry; along the meridians no
-    # plane through e3 is preferred
+    # if the angle 0 is along a vector, the planes through e3 along and across it may be planes of
+    # symmetry; if it is along the meridians, no plane through e3 is preferred
     azimuths: tuple[float, ...] = ()
     if direction is not None:
         azimuth = float(np.arctan2(direction[1], direction[0]))

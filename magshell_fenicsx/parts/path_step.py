@@ -95,7 +95,8 @@ class PathStep(Step):
         Exceptions are a bound beside `until: limit`, and the target of a branch that is followed.
         """
         targets, prescribed = self._given_targets, self.prescribed
-        # arc length reaches targets of the load and of the conjugate, other controls their own
+        # keys of targets that the control reaches: arc length those of the load and of the
+        # conjugate, other controls those of the quantity that they prescribe
         fitting = [
             key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)
         ]
@@ -104,7 +105,7 @@ class PathStep(Step):
                 raise ValueError(
                     f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size"
                 )
-        # until: target needs one target that fits, or has a default
+        # until: target needs one target that fits; a step with a default target, `_end`, needs none
         has_one_target = len(targets) == 1 or (not targets and bool(self._end))
         if self.until == "target" and not (has_one_target and set(targets) <= set(fitting)):
             names = " or ".join(fitting) or "another control"
@@ -124,8 +125,13 @@ class PathStep(Step):
             )
         if self.until == "limit" and targets:
             self._refuse_unfit_bound(list(targets), fitting)
+        self._refuse_unfit_end()
+        return self
+
+    def _refuse_unfit_end(self) -> None:
+        """Check that the control fits the end of the path, and what follows it fits the end."""
         # ends that need arc length
-        if self.until in ("points", "zero") and prescribed != "arc":
+        if self.until in ("points", "zero") and self.prescribed != "arc":
             why = (
                 "counts steps by arc length"
                 if self.until == "points"
@@ -139,7 +145,6 @@ class PathStep(Step):
             raise ValueError("then: follow: goes with until: bifurcation")
         if self.snap != SnapSection() and self.then != "snap":
             raise ValueError("snap: goes with then: snap")
-        return self
 
     def _refuse_unfit_bound(self, targets: list[str], fitting: list[str]) -> None:
         """Check the target beside `until: limit`: it must be the end of the path.
@@ -165,7 +170,7 @@ class PathStep(Step):
     @classmethod
     def level(cls, text: str, context: Context) -> float:
         """Return a value of a history with a unit, converted as a target of the load."""
-        # the first target of the load with a unit has the conversion
+        # the type of the key of a load's target says how text with a unit is converted
         for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
             annotation = cls.model_fields[key].annotation
             if is_over_unit(annotation):
@@ -205,7 +210,7 @@ class PathStep(Step):
     def target(self) -> tuple[Target, float] | None:
         """The target at which the path ends, and its value in the unit of its key; None without.
 
-        A target beside `until: limit` is none, see `limit_target`.
+        A target beside `until: limit` does not count here: it is a bound, the `limit_target`.
         """
         if self.limit_target:
             return None
@@ -255,7 +260,8 @@ class PathStep(Step):
         The targets divide the way into equal parts. The way begins at zero if the amplitude is
         driven for the first time; targets that earlier steps have passed are left out.
         """
-        # the end of the path: a target or bound, with its value in the unit of its key
+        # the end of the path: a target or bound, with its value in the unit of its key; it is of
+        # the load (`by_load`), the amplitude, or of its conjugate
         goal = self.target or self.limit_target
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
@@ -274,13 +280,13 @@ class PathStep(Step):
         first_change = self.first_change(change, load_start, by_load=by_load)
         first_step = self.step(None if goal is None else change, load_start)
         return Drive(
-            self.prescribed,
-            quantity,
-            end,
-            targets,
-            first_change,
-            self.scale(load_start),
-            first_step,
+            control=self.prescribed,
+            quantity=quantity,
+            end=end,
+            targets=targets,
+            first=first_change,
+            scale=self.scale(load_start),
+            step=first_step,
         )
 
     def course(self, step_start: StepStart) -> StepCourse:
@@ -391,12 +397,10 @@ class FactorStep(LoadStep):
 
         Before the load it grows by arc length, with a first step of half the way.
         """
+        if not self._alone:
+            return super().drive(load_start)
         size = load_start.size  # the amplitude at a factor of one
-        return (
-            Drive("arc", "load", size, [size], first=size / 2, scale=size)
-            if self._alone
-            else super().drive(load_start)
-        )
+        return Drive("arc", "load", end=size, targets=[size], first=size / 2, scale=size)
 
     def course(self, step_start: StepStart) -> StepCourse:
         """Return the course of the step; before the load, it forbids an instability on the way."""

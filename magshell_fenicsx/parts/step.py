@@ -177,9 +177,10 @@ class Step(Section):
         raise NotImplementedError
 
     def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
-        """Return the amplitudes that are functions of the step's own, from any state of the step.
+        """Return the other amplitudes that are functions of the step's own one.
 
-        None without such functions; see `StepCourse.curves`.
+        They come with the value of the step's own amplitude at its begin. None without such
+        functions.
         """
         return None
 
@@ -252,7 +253,7 @@ class Step(Section):
         """
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        """Return energies with the step's amplitude, given by densities alone; see `OwnTerm`."""
+        """Return the energies that the step's amplitude multiplies and that densities define."""
         return []
 
     def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
@@ -348,7 +349,10 @@ class Step(Section):
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
-        """Return fields of `Loads`, as `adds`, if another step holds or drives this amplitude."""
+        """Return fields of the model's `Loads` that another step's hold or drive asks for.
+
+        That step holds or drives the amplitude of this kind of step.
+        """
         return {}
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

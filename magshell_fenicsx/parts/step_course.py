@@ -32,9 +32,8 @@ Until = Annotated[
 ]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
-Curves = Mapping[
-    str, Callable[[float], tuple[float, float, float]]
-]  # of several amplitudes, see `Along`
+# other amplitudes as functions of the one that a step drives: value and two derivatives
+Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]
 
 
 class GasSection(Section):
@@ -129,7 +128,7 @@ class LoadStart:
     is_driven
         Whether an earlier step has driven the amplitude.
     size
-        The amplitude at a target of one, see `Step.size`.
+        The amplitude at a target of one unit of the target's key.
     h
         Thickness over R.
     """
@@ -252,7 +251,12 @@ class StepStart:
         name = self.step.name
         size = self.step.load.size(self.context)
         return LoadStart(
-            self.mu[name], -self.potential(name), self.unit(name), self.is_driven, size, self.h
+            value=self.mu[name],
+            conjugate=-self.potential(name),
+            unit=self.unit(name),
+            is_driven=self.is_driven,
+            size=size,
+            h=self.h,
         )
 
 
@@ -269,8 +273,8 @@ class StepCourse:
     steps
         The largest number of steps; None for that of the path.
     curves
-        Amplitudes that are functions of the step's own, and its value; None where the model has
-        these functions itself.
+        Other amplitudes as functions of the step's own one, each with two derivatives, and the
+        value of the own one; None where the model has these functions itself.
     finer
         Function of a path's options of step lengths that returns finer ones; None to keep them.
     forbidden

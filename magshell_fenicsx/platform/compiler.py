@@ -149,6 +149,8 @@ class Library:
     ----------
     file
         Name of the library's file in the cache.
+    _source, _options, _gnu_options
+        The parameters of these names.
     _compilation
         The compilation by this process, in a thread; None before it starts.
     _lock

@@ -105,6 +105,8 @@ class Files:
         Whether all ranks have the same contents.
     given
         Objects that a program gives in place of files, each with a `digest`.
+    _digests
+        File -> hash of its content, where it has been asked for.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -132,7 +134,7 @@ class Files:
         Raises
         ------
         OSError
-            If the file cannot be read, see `read_bounded`; the same at each call.
+            If the file cannot be read, is no regular file, or is too large; the same at each call.
         """
         if file not in self.contents:
             try:

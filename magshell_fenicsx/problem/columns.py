@@ -70,6 +70,7 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     reported_supports = problem.supports if problem.reactions else ()
     before_points, after_points = list[str](), list[str]()
     for registered in OBSERVABLES:
+        # one of both lists, which grows in place
         columns = before_points if registered.before_points else after_points
         columns += registered.columns(loads, reported_supports)
     # a shell that is released at the end of a step moves in time too

@@ -174,7 +174,8 @@ def refined_squares(
     outline
         The surface with its chart, whose extent the squares cover.
     sizes
-        Samples of squares -> element size over R that each square needs; see `Sizes`.
+        Function of samples (squares, n, 3), of whether each is on the chart, and of the side of the
+        squares, to the element size (squares,) over R that each square needs.
     min_size
         Least side of a square, over R.
     """
@@ -290,7 +291,8 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
         return x, area
 
-    # one part for each triangle: all of it
+    # one part for each triangle, all of it; parts are then divided until their samples show the
+    # formulas
     reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
     undivided = reference.in_each_cell(np.arange(len(triangles)))
     return refine_where_hidden(formulas, undivided, places_and_areas, lattice, len(triangles))
@@ -304,9 +306,10 @@ def _chart_triangles(shape: PlaneShape | Grid) -> Array:
     low, high = extent(shape)
     t = [np.linspace(a, b, ceil((b - a) / FIRST_SIDE) + 1) for a, b in zip(low, high, strict=True)]
     corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
-    # a, b, c, d are the four corners of all rectangles, as parts of the grid of corners: along an
-    # axis, 0 leaves out the last corner ([0:-1]), and 1 leaves out the first ([1:None])
-    a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
+    # the four corners of all rectangles, as parts of the grid of corners: a rectangle begins at
+    # each corner but the last along an axis, and ends at each but the first
+    a, b = corners[:-1, :-1], corners[:-1, 1:]
+    c, d = corners[1:, :-1], corners[1:, 1:]
     return np.concatenate(
         [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
     )
@@ -321,7 +324,8 @@ def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
     Parameters
     ----------
     leaves
-        Divisions of the surface for each key with formulas, see `adaptive_cells`.
+        Divisions of the surface for each key with formulas, whose small cells show where these
+        vary.
     """
     places: list[Array] = [np.zeros((0, 3))]
     for cells in leaves:
@@ -348,8 +352,8 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
     values
         Places (n, 3) -> values (n, formulas).
     leaves
-        Division of the surface that shows the formulas, see `adaptive_cells`; None where nothing is
-        hidden between samples.
+        Division of the surface whose small cells show where the formulas vary; None where nothing
+        is hidden between samples.
     """
     # mean and variance are kept from call to call: smaller squares see more of the variance
     variance: float = 0.0
@@ -449,8 +453,8 @@ def formula_refinements(
     Parameters
     ----------
     leaves_of_formulas
-        For each key the division that shows its formulas, see `adaptive_cells`; None if the samples
-        of squares suffice.
+        For each key the division of the surface whose small cells show where its formulas vary;
+        None if the samples of squares suffice.
     outline
         The surface, with imperfections that do not grow.
     turn
@@ -515,7 +519,7 @@ def imperfection_refinements(
         assert not isinstance(shape, MeshFile)  # it has no squares
         if _saves_elements(squares, shape):
             local.append(squares)
-        else:
+        else:  # the least size in the squares is needed everywhere
             size_everywhere = min(size_everywhere, squares.size)
     return local, size_everywhere
 
@@ -523,12 +527,15 @@ def imperfection_refinements(
 def _saves_elements(squares: SquaresFeature, shape: PlaneShape | Grid) -> bool:
     """Return whether a mesh that is fine in squares alone has far fewer elements.
 
-    It is compared with a mesh that is everywhere as fine as the finest square; see
-    `GRADED_MESH_GAIN`.
+    It is compared with a mesh that is everywhere as fine as the finest square, and must have less
+    than the part `GRADED_MESH_GAIN` of its elements.
     """
     low, high = extent(shape)
-    cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / squares.size**2
-    graded_cells = squares.cells(float(np.linalg.norm(high - low)) / 2)
+    least_size = squares.size
+    cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / least_size**2
+    # elements in the squares and around them, up to the distance of half the chart's diagonal
+    half_diagonal = float(np.linalg.norm(high - low)) / 2
+    graded_cells = squares.cells(half_diagonal)
     return graded_cells < GRADED_MESH_GAIN * cells_of_equal_size
 
 
@@ -544,6 +551,7 @@ def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
     """
 
     def sizes(x: Array, on_chart: Masks, side: float) -> Array:
+        # `side`, that of the squares, is not used here
         some_places = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
         some_on_chart = on_chart.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2]
         needed_sizes = size_at(some_places.reshape(-1, 3)).reshape(some_places.shape[:-1])
@@ -609,7 +617,7 @@ def _unresolved_formula(
             "variation may not be seen"
         )
     stiffness_error = _stiffness_error(values, cells, fit.nodal) if is_thickness else 0.0
-    # over deformed places the integral is not exact: a large error of the square counts as its own
+    # over deformed places the integral is inexact: it has at least a large error of the square
     counts_square = spec.deformed and missed_square > SQUARE_TOLERANCE
     missed_integral = max(fit.missed, missed_square if counts_square else 0.0)
     # a load on elements small enough for it may be smoothed
@@ -668,11 +676,8 @@ def _stiffness_error(
     # cells' polynomial p of it
     phi, weight = curvatures.tabulate(0, X)[0, :, :, 0], (area * w)[..., None]
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
-    # compliance of each cell (c) under a constant moment: m A^-1 m, with the integrals m of phi_i
-    # and A of p^3 phi_i phi_j over its points (q)
-    moment = np.einsum("cq,qi->ci", area * w, phi)
-    A = np.einsum("cq,cq,qi,qj->cij", area * w, p[..., 0] ** 3, phi, phi, optimize=True)
-    compliance = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
+    # compliance and stiffness (cells,) of the cells
+    compliance = _compliances(area * w, p[..., 0] ** 3, phi)
     stiffness = (weight * p**3).sum(axis=(1, 2))
     # stiffness and compliance (cells, 2) of the exact thickness, and their errors
     exact_values = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
@@ -686,6 +691,26 @@ def _stiffness_error(
         cells.sum_over_ranks(v[..., None] * squared_moments[:, None]) for v in (error, exact_values)
     )
     return float((error_integral / exact_integral).max())
+
+
+def _compliances(weights: Array, stiffness: Array, phi: Array) -> Array:
+    """Return the compliance (cells,) of each cell under a constant moment.
+
+    It is m A^-1 m, with the integrals m of phi_i and A of stiffness phi_i phi_j over the cell.
+
+    Parameters
+    ----------
+    weights
+        (cells, q) weights of the quadrature points of each cell.
+    stiffness
+        (cells, q) stiffness at these points.
+    phi
+        (q, n) basis functions of the curvature.
+    """
+    moment = np.einsum("cq,qi->ci", weights, phi)
+    A = np.einsum("cq,cq,qi,qj->cij", weights, stiffness, phi, phi, optimize=True)
+    compliance = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
+    return np.asarray(compliance)
 
 
 def _positions_in_box(x: Array, comm: MPI.Comm) -> Array:

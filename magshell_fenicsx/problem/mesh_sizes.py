@@ -209,5 +209,6 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
         return features
     if not outline.disc or context.shell.geometry == "disc":
         return []
+    # of the sizes that loads allow along the rim, over sqrt(Rh), the largest
     size = max((step.load.rim(sizing) for step in context.steps), default=EDGE_SIZE)
     return [RingFeature(outline.edge, size * sqrt(h) / sizing.refinement, growth)]

@@ -382,7 +382,8 @@ class Problem:
 
     def flat_triangle(self, patch: PatchMesh) -> str:
         """Return a message about a triangle that is too flat for the penalty; empty if none is."""
-        return flat_triangle(patch, *self._penalty_and_unit)
+        penalty, default_penalty_of_degree, length, unit = self._penalty_and_unit
+        return flat_triangle(patch, penalty, default_penalty_of_degree, length, unit)
 
     @property
     def _file_of_shell(self) -> MeshFile | None:
@@ -480,6 +481,7 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         axis=has_pole,
         largest=min(MAX_MERIDIAN_CELL_SIZE * sqrt(h), meridian.largest),
         contact_size=contact_cells,
+        # the size that the case gives for all cells, over R; None without
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
 
@@ -491,9 +493,11 @@ def _vertices_of_shells(problem: Problem, meridian: MeridianChart) -> NDArray[np
     """
     vertices, last_vertex = list[NDArray[np.float64]](), -inf
     for shell in meridian.shell_meridians:
+        # contacts as (size, distance from the begin within which they may be); another shell may
+        # touch all of this one, and asks for no size of its own
         touches_shells = any(pair.has(shell.name) for pair in problem.loads.pairs)
-        anywhere = [(inf, shell.length)] if touches_shells else []
-        shell_vertices = shell.vertices([*problem.body_contacts, *anywhere])
+        contact_of_shells = [(inf, shell.length)] if touches_shells else []
+        shell_vertices = shell.vertices([*problem.body_contacts, *contact_of_shells])
         vertices.append(shell_vertices[shell_vertices > last_vertex])
         last_vertex = float(shell_vertices[-1])
     return np.concatenate(vertices)

@@ -107,6 +107,7 @@ def refuse_unfit(
     _refuse_ambiguous(patch.edges, patch.points, conditions)
     for registered in OBSERVABLES:
         registered.refuse_unfit(loads, patch)
+    # patches with a thickness of their own: `patch_of` raises if there is no such patch
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")
 

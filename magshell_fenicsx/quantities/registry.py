@@ -336,9 +336,11 @@ def amplitude(name: str) -> Amplitude:
     user-defined amplitude has a column of its own name.
     """
     if further_load := re.fullmatch(r"(force|load)_\d+", name):
-        return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[further_load[1]].place)
+        first_load = AMPLITUDES[further_load[1]]
+        return Amplitude(name, column=name, conjugate=f"w_{name}_over_h", place=first_load.place)
     if name in AMPLITUDES:
         return AMPLITUDES[name]
+    # one of a family, such as "approach_ball": its columns end in "_ball" too
     for family in AMPLITUDES.values():
         if family.each and name.startswith(f"{family.name}_"):
             suffix = name.removeprefix(family.name)
@@ -365,9 +367,10 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     # reaction, or that of the only motion
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
     candidates = [*(f"{reaction}_{name}" for reaction in reactions), *reactions]
-    for reaction in candidates if name not in AMPLITUDES else []:
-        if reaction in row:
-            return shown_quantity(name, row), shown_quantity(reaction, row)
+    if name not in AMPLITUDES:
+        for reaction in candidates:
+            if reaction in row:
+                return shown_quantity(name, row), shown_quantity(reaction, row)
     # any other amplitude: its conjugate, in a column of its own if there is one
     varying, own_column = amplitude(name), f"w_{name}_over_h"
     conjugate = shown_quantity(own_column if own_column in row else varying.conjugate, row)
@@ -440,6 +443,7 @@ class Sizes:
     def size(self, name: str) -> float:
         """Return the size, in the case's unit, of a 1 in the column `name`; 1 without a unit."""
         if name in self.distances:
-            return self.distances[name][1]
+            _, size = self.distances[name]
+            return size
         unit = self.unit(name)
         return self.by_unit[unit.key] if unit else 1.0

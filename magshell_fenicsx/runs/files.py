@@ -147,9 +147,9 @@ def _refuse_other_case(out: Path, document: Document) -> None:
 
 
 def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
-    """Return what the run in a folder depends on: case, files, sources; see `checkpoint.identity`.
+    """Return what the run in a folder depends on: the case, and hashes of files and sources.
 
-    Empty without checkpoint and summary.json.
+    The keys are those of a checkpoint. Empty without checkpoint and summary.json.
 
     Raises
     ------
@@ -232,7 +232,8 @@ def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> N
     saved_identity |= {key: summary[key] for key in keys if key in summary}
     checkpoint.refuse_other_case(saved_identity, document, out)
     try:
-        points = len(read_run(out)[1])
+        _, rows = read_run(out)
+        points = len(rows)
     except FileNotFoundError as e:
         raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
     for number in range(points):
@@ -274,6 +275,11 @@ class RunFiles:
         Number of points of an interrupted run with rows and fields on disk.
     elapsed
         Run time in seconds of the interrupted run up to the last of these points.
+    _folder, _empty_checkpoint, _mesh
+        The parameters of these names.
+    _scene, _comm
+        The present scene, which may be that of a larger model after an instability, and its
+        communicator.
     _rows
         Rows of path.csv that the interrupted run has written.
     _gatherer
@@ -330,10 +336,8 @@ class RunFiles:
         recognised as those of a run.
         """
         folder, file = self._folder, self._folder / checkpoint.NAME
-        new_checkpoint, earlier_files = (
-            folder / NEW_CHECKPOINT,
-            files_of_runs(folder) - {NEW_CHECKPOINT},
-        )
+        new_checkpoint = folder / NEW_CHECKPOINT
+        earlier_files = files_of_runs(folder) - {NEW_CHECKPOINT}
         write_whole(new_checkpoint, self._empty_checkpoint)  # a full disk stops here
         remove(folder, earlier_files - {SUMMARY, file.name})
         if self._mesh:
@@ -343,7 +347,7 @@ class RunFiles:
 
     def _remove_end_of_run(self) -> None:
         """Delete the files that the end of an interrupted run has written; on rank 0."""
-        # the fields of points stay
+        # the fields of points stay, and so do the checkpoint, path.csv and the chosen mesh
         files = files_of_runs(self._folder)
         files = {name for name in files if not name.startswith("fields/")}
         remove(self._folder, files - set(FILES_OF_PATH))
@@ -459,7 +463,8 @@ class RunFiles:
             (self._folder / MANIFEST).unlink(missing_ok=True)  # `plot` may have made one meanwhile
             write_manifest(self._folder)
 
-        with suppress(DiskError):  # without the list, summary.json says that they are
+        # a folder without the list is still known by its summary.json
+        with suppress(DiskError):
             access_disk(self._comm, list_files)
 
 

@@ -4,7 +4,8 @@ A result is a number of the run, such as "knockdown", or a column of path.csv at
 path. A parameter is what it is differentiated by: a number of the case, an amplitude (load
 parameter), or a whole field, such as the thickness. One adjoint solve gives all derivatives of a
 result. Those by a field are a density, per area of the undeformed shell. A scene is the model of a
-problem with its solver. A model of half a shell has the multiplicity 2.
+problem with its solver. A model of half a shell has the multiplicity 2. `say` prints a line of
+text.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -146,7 +147,7 @@ def _entries_of_fields(
     """Return the numbers about gradients by fields, by parameter, and write the file; collective.
 
     The keys of an entry are those of summary.json: `alike` is the derivative by a uniform change,
-    `most_per_area` and `at` are those of `_largest_density`.
+    `most_per_area` the largest norm of the gradient per area, and `at` the place where it is.
 
     Parameters
     ----------
@@ -212,10 +213,12 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
         If the run has no such result.
     """
     scene, history = result.scene, result.path_history
-    # a result at the first instability of the path: its kind and its adjoint
+    # a result at the first instability of the path, which comes as (kind, adjoint)
     if name in FOLDS:
-        first, *_ = instabilities(scene, history.located, name, max_count=1, begins=history.begins)
-        return first
+        first_kind_and_adjoint, *_ = instabilities(
+            scene, history.located, name, max_count=1, begins=history.begins
+        )
+        return first_kind_and_adjoint
     # a result at the end; a path that has not reached its end has none
     reason = next(
         (remark for remark in result.remarks if remark.startswith(BEYOND_INSTABILITY)), None
@@ -246,7 +249,8 @@ def _by_uniform_change(scene: Scene, parameter: str, gradient: FieldGradient) ->
 def _largest_density(surface: Surface, parameter: str) -> dict[str, Any]:
     """Return the largest norm of a field's gradient per area, and the undeformed place (3,) over R.
 
-    The keys are those of summary.json: most_per_area and at.
+    They are the entries `most_per_area` and `at` of summary.json. `parameter` is that of the
+    gradient, which has one or more fields of the surface.
     """
     columns = [surface.fields[name] for name in columns_of(parameter)]
     sizes = np.linalg.norm(np.column_stack(columns), axis=1)

@@ -6,7 +6,7 @@ is reduced by symmetry (a half, a sector, a meridian) excludes modes; the whole 
 that has all. The label of a mode names its symmetry, such as "m = 2" or "antisymmetric"; it is
 empty for a mode of the model itself. omega2 is omega^2 rho R^2/E. E, h, R and rho are Young's
 modulus, thickness, reference length and density. A gatherer brings the fields of all ranks to
-rank 0.
+rank 0. `say` prints a line of text.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -197,8 +197,8 @@ class _ModeWriter:
         )
         # a file for each requested mode, and a line about the softest of each point
         for number, modes in by_point.items():
-            for rank, mode in enumerate(modes[: section.modes], 1):
-                file = mode_file(self.folder, number, str(rank), mode.label)
+            for mode_number, mode in enumerate(modes[: section.modes], 1):
+                file = mode_file(self.folder, number, str(mode_number), mode.label)
                 whole_shell, _, gathering = self._modes_of_whole_shell(number)
                 state, scene = whole_shell.state(points[number]), self.result.scene_of(number)
                 write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
@@ -254,7 +254,8 @@ def write_mode_of(
     state, vector
         State and mode, in the unknowns of that model.
     label
-        Label of the mode, see `mode_fields.mode_surface`.
+        Label of the mode, such as "m = 2" or "antisymmetric", which tells how the mode continues
+        beyond the modelled part; empty if it has the symmetry of the model.
     whole_shell
         The model with all modes of the shell, if it has the mode; None if the scene's model has it.
     """
@@ -335,8 +336,10 @@ def _contact_warning(point: int, rank: int, mode: ShellMode, change: float) -> s
 
     Parameters
     ----------
-    point, rank
-        Number of the row, and of the frequency from 1.
+    point
+        Number of the row.
+    rank
+        Number of the frequency, from 1 for the lowest.
     change
         Relative change of omega^2 with bodies four times as stiff; nan if unknown.
     """
@@ -382,7 +385,8 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
             modes_of_scene[id(scene)] = whole_shell, ShellModes(whole_shell.model)
         whole_shell, shell_modes = modes_of_scene[id(scene)]
         whole_shells[number] = whole_shell
-        # the modes, and how they depend on the stiffness of a contact
+        # the state with bodies in contact so stiff that their stiffness does not matter; its modes,
+        # and how they still depend on that stiffness
         state = stiffened_equilibrium(scene, state)
         try:
             modes = shell_modes.vibrations(
@@ -394,9 +398,9 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
             if scene.model.contacts:
                 changes = contact_changes(scene, state, modes)
                 result.contact_changes[number] = changes
-                for rank, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
-                    if not change <= MAX_CONTACT_CHANGE:
-                        say(_contact_warning(number, rank, mode, change))
+                for mode_number, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
+                    if not change <= MAX_CONTACT_CHANGE:  # nor is nan
+                        say(_contact_warning(number, mode_number, mode, change))
         except ModesNotFound as e:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
@@ -437,8 +441,8 @@ def _write_frequencies(
         scene, whole_shell = result.scene_of(number), whole_shells[number]
         gathering = gatherer(whole_shell.model, scene.comm)
         state = whole_shell.state(states[number])
-        for rank, mode in enumerate(result.frequencies[number][:count], 1):
-            file = mode_file(folder, number, f"f{rank}", mode.label)
+        for mode_number, mode in enumerate(result.frequencies[number][:count], 1):
+            file = mode_file(folder, number, f"f{mode_number}", mode.label)
             write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
 
 
@@ -475,7 +479,8 @@ def _lowest_frequency(
     number
         Number of the point's row.
     wave_of_symmetric
-        Wave of modes without a label, see `symmetric_wave`.
+        Name of the wave of modes without a label: "0" on a meridian, "symmetric" on a half, empty
+        on the whole shell.
     time_unit
         Unit of time (s), for hertz; None without.
     """

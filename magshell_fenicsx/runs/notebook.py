@@ -199,7 +199,7 @@ def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
     divided.Update()
     smooth = pyvista.PolyData(divided.GetOutput())
     body = surface.is_body  # its edges stay sharp
-    # of points alone; the cells of a surface are oriented alike already
+    # normals of points alone; the cells of a surface are oriented alike already
     return smooth.compute_normals(
         cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False
     )

@@ -32,6 +32,8 @@ class RowMaker:
 
     Attributes
     ----------
+    _scene
+        The first scene of the path; a record of a larger model has a scene of its own.
     _count
         Number of rows so far.
     _field_end

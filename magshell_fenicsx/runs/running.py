@@ -5,8 +5,8 @@ A signal or a time limit stops a run between two solves or two steps in time.
 A scene is the model of a problem with its solver. A record is a point of the path, with the scene
 that it belongs to; a row has its columns of path.csv. The journal, or checkpoint, keeps the result
 of each solve; a resumed run replays these instead of solving, until they are used up. A status is a
-line of text that the next one replaces. The result grows with the run. All ranks (processes) run
-the same code; only rank 0 prints and writes.
+line of text that the next one replaces. `say` prints a line that stays, `tell` shows a status. The
+result grows with the run. All ranks (processes) run the same code; only rank 0 prints and writes.
 """
 
 import signal
@@ -90,6 +90,10 @@ class Watch:
 
     Attributes
     ----------
+    _comm, _start, _limit
+        The parameters of these names.
+    _signals
+        The signals that are recorded; empty if none are.
     _reason
         Name of the signal, or the time limit, that asks this rank to stop; None without.
     _handlers_before
@@ -165,7 +169,8 @@ class Watch:
 class StoppableJournal:
     """Journal of solver results that stops the run before a new solve if the watch requests it.
 
-    It wraps another `SolverJournal`, to which it passes every call. All methods are collective.
+    It wraps another journal (`_journal`), to which it passes every call, and asks the `_watch`. All
+    methods are collective.
     """
 
     def __init__(self, journal: SolverJournal, watch: Watch) -> None:
@@ -249,8 +254,19 @@ def run(  # noqa: PLR0913 - what a user gives
 ) -> Result:
     """Run a problem, and write its results into a folder if one is given; collective.
 
-    A `Problem` holds everything that will be computed. See `public.run` for the parameters: its
-    `case` takes a problem as one of several forms. Without a folder `out`, nothing is written.
+    A `Problem` holds everything that will be computed.
+
+    Parameters
+    ----------
+    out
+        Folder of the results; None writes nothing.
+    say, tell
+        Functions for lines that stay, and for statuses, which the next status replaces. Without
+        `tell`, no status is shown.
+    resume, overwrite
+        Whether the run in the folder goes on, or whether another run may be replaced.
+    time_limit, pictures
+        Seconds after which the run stops, None without; and whether pictures are drawn.
 
     Raises
     ------
@@ -298,7 +314,9 @@ def _kernel_progress(output: RunOutput, *, keeps_first: bool) -> Say:
 
     def report(what: str) -> None:
         """Print or show a report with the time so far."""
-        next(first_reports, output.tell)(status_line(what, time.perf_counter() - output.start))
+        # `say` for the first report if it is kept, `tell` for all others
+        show = next(first_reports, output.tell)
+        show(status_line(what, time.perf_counter() - output.start))
 
     return report
 
@@ -343,7 +361,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
     interruption: RuntimeError | None = None
     scene.progress = progress = RunProgress(scene, output.tell, output.start)
     with output.watch:
-        # no journal until the first point has opened the files, which have one
+        # `_follow` sets the journal of the files when they are opened, at the first point
         scene.journal = StoppableJournal(NoJournal(), output.watch)
         try:
             _follow(result, files, output, progress)
@@ -383,6 +401,7 @@ def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -
         With the place in the case before the message.
     """
     try:
+        # modes of the perfect shell become imperfections, where the case asks for this
         problem = with_modes(problem, output.comm)
         mesh = _mesh_for_tolerance(problem, folder, output.comm, output.say, output.report)
         output.report("mesh and kernels")
@@ -626,7 +645,8 @@ def _barrier(result: Result) -> float | None:
     It is between the states at the step's begin and end; None for other last steps.
     """
     steps, begin = result.scene.problem.programme, result.path_history.begin
-    # until: zero passes the largest load, back to the load zero: the top of the barrier
+    # a step with `until: zero` passes the largest load and goes back to the load zero: the unstable
+    # state there, of the highest energy, is the top of the barrier
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
     from magshell_fenicsx.simulate.results import barrier
@@ -653,7 +673,8 @@ def _follow(
     """
     scene, row_maker = result.scene, RowMaker(result.scene)
     for record in follow(scene, remark=result.remarks.append):
-        # the first point opens the files, with their journal: before the first solve of a step
+        # at the first point, which comes before the first solve of a step, the files are opened,
+        # and the scene takes their journal
         if files and not result.rows:
             if files.journal is None:
                 files.begin()
@@ -694,7 +715,8 @@ def _line(row: Row) -> str:
     varied = ""
     if row["amplitude"]:
         varied = amplitude(str(row["amplitude"])).column
-    # column of the force; of several bodies each has its own, which is the conjugate
+    # column of the force: of one body "force"; of several bodies each has its own, such as
+    # "force_a", which is the conjugate of the amplitude that moves the body
     force_column = "force"
     conjugate = amplitude(str(row["amplitude"])).conjugate
     if "load_factor" in row:
@@ -710,7 +732,7 @@ def _line(row: Row) -> str:
     excluded = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
     if row["negative_pivots"] or excluded:
         fields.append(f"unstable {row['negative_pivots']}{excluded}")
-    # the other loads, where they are not zero
+    # the other loads, where they are not zero, and the displacement of the pole, if it is another
     fields += [_value(name, row, formats[name]) for name in formats if name != varied and row[name]]
     if row["w_pole_over_h"] != row["w_over_h"]:
         fields.append(_value("w_pole_over_h", row, "8.4f", "pole"))

@@ -164,6 +164,21 @@ class RunProgress:
         Function that shows a status line in place of the one before.
     start
         Start of the run, in seconds of `time.perf_counter`.
+
+    Attributes
+    ----------
+    _scene, _report, _start
+        The parameters of these names.
+    _path_ends
+        End of each step of the programme.
+    _step
+        Number of the present step of the programme, from 1.
+    _row, _first
+        Rows of path.csv: of the last point of the path, and of the point where the step begins.
+    _points, _steps
+        Number of points of the run, and of steps of the solver in this step of the programme.
+    _at_begin, _at_present
+        Completed part of the step and time (s): where the speed is measured from, and now.
     """
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:

@@ -302,15 +302,17 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     `total_s` is the time of the run in seconds.
     """
     scene = result.scene
+    # the problem as the case has it, before its mesh was adapted
     requested_problem = result.adapted.asked if result.adapted else scene.problem
-    material, model, newton = scene.problem.material, scene.model, scene.newton
-    R_over_h = 1 / material.h
+    model, newton = scene.model, scene.newton
+    # entries that only some runs have: of the first snap, and of mesh.tolerance
     snaps_of_run = snaps(result.rows)
     snap_times, tolerance = dict[str, float](), dict[str, Any]()
     if snaps_of_run and scene.sizes.unit("time"):
         snap_times = _in_milliseconds(snaps_of_run[0], scene.sizes)
     if result.adapted:
         tolerance = {"tolerance": result.adapted.account(result.value, result.branch_error)}
+    # what parts observe at the end, such as reactions
     observed = dict[str, Any]()
     for observables in OBSERVABLES:
         observed |= observables.summary(result.scene_of(result.end).view, result.last)
@@ -320,24 +322,10 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         CASE_FILE: requested_problem.document.name,
         **requested_problem.document.outside,
         "sources": code_version(),
-        "dimensionless": {
-            "radius_to_thickness": R_over_h,
-            "poisson_ratio": material.nu,
-            "lambda_m": scene.problem.lambda_m,
-            "Lambda_m": scene.problem.lambda_m * R_over_h,
-            "pc_over_E": material.classical_pressure,
-            "energy_unit": "E h R^2",
-        },
+        "dimensionless": _dimensionless_numbers(scene),
         "dimensions": _dimensions(scene.problem.context.shell),
         "in_units": in_units(result),
-        "model": {
-            "included": scene.problem.included,
-            "left_out": scene.left_out,
-            **({"not_shown": scene.unresolved} if scene.unresolved else {}),
-            "kernels": model.kernels.names,
-            "forms": len(model.kernels.names),
-            "penalty": model.sigma,
-        },
+        "model": _model_entry(scene),
         "stopped": result.stopped,
         "remarks": result.remarks,
         "limit_points": result.limit_points,
@@ -355,21 +343,57 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
         **tolerance,
-        "timing": {
-            "jit_s": model.kernels.seconds,
-            "setup_s": scene.setup_s,
-            "assembly_s": model.system.assembly.seconds,
-            "factor_s": newton.factorisation.stopwatch.seconds,
-            "output_s": result.output.seconds,
-            "solve_s": newton.factorisation.solving.seconds,
-            "total_s": total_s,
-        },
+        "timing": _timing(result, total_s),
         "replayed": result.replayed,
         "factorisations": newton.factorisation.count,
         "iterations": newton.iterations,
         "ranks": scene.comm.size,
         "blas": fast_blas() or "reference",
         "versions": versions(),
+    }
+
+
+def _dimensionless_numbers(scene: Scene) -> dict[str, Any]:
+    """Return the dimensionless numbers of a scene's shell, as an entry of summary.json."""
+    material = scene.problem.material
+    R_over_h = 1 / material.h
+    return {
+        "radius_to_thickness": R_over_h,
+        "poisson_ratio": material.nu,
+        "lambda_m": scene.problem.lambda_m,
+        "Lambda_m": scene.problem.lambda_m * R_over_h,
+        "pc_over_E": material.classical_pressure,
+        "energy_unit": "E h R^2",
+    }
+
+
+def _model_entry(scene: Scene) -> dict[str, Any]:
+    """Return what the model includes and leaves out, and its kernels, as an entry of summary.json.
+
+    `not_shown` are details of formulas that its cells miss, if there are any.
+    """
+    model = scene.model
+    return {
+        "included": scene.problem.included,
+        "left_out": scene.left_out,
+        **({"not_shown": scene.unresolved} if scene.unresolved else {}),
+        "kernels": model.kernels.names,
+        "forms": len(model.kernels.names),
+        "penalty": model.sigma,
+    }
+
+
+def _timing(result: Result, total_s: float) -> dict[str, float]:
+    """Return the times of the parts of a run, and of all of it, as an entry of summary.json."""
+    model, factorisation = result.scene.model, result.scene.newton.factorisation
+    return {
+        "jit_s": model.kernels.seconds,
+        "setup_s": result.scene.setup_s,
+        "assembly_s": model.system.assembly.seconds,
+        "factor_s": factorisation.stopwatch.seconds,
+        "output_s": result.output.seconds,
+        "solve_s": factorisation.solving.seconds,
+        "total_s": total_s,
     }
 
 

@@ -88,7 +88,8 @@ class MeridianChart:
     shell_meridians
         Meridians of several shells; empty for one shell.
     joints
-        For each joint of shells both parameters: two edges that meet have the same one.
+        For each joint of two shells the parameter on the first and on the second one. Two edges
+        that meet have the same; where an edge ends on another shell (a T-junction), they differ.
     """
 
     length: float

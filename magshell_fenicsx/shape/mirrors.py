@@ -58,7 +58,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     mirrors = []
     flips = FLIPS if is_square and not any(grid.glued) else FLIPS[:2]
     for axis, (flip, images_of_sides) in enumerate(flips):
-        # around e3 a closed surface has all planes, see `Outline.mirrors`
+        # a surface that is closed around e3 has all planes through e3, which are not listed here
         if axis == 0 and grid.glued[0]:
             continue
         mirror = _plane_between(places(sample), places(np.column_stack(flip(*sample.T))))

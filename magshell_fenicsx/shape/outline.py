@@ -348,7 +348,11 @@ def _mesh_outline(shell: MeshSurface) -> Outline:
         return _multi_shell_outline(file, in_memory)
 
     def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
-        """Return the planes that map the triangles onto themselves, see `mesh_mirrors`."""
+        """Return the planes that map the triangles onto themselves, each with either half.
+
+        The planes contain `vectors`, if there is a choice. With `loosely`, a plane may also map
+        areas and centres onto each other, but not the triangles.
+        """
         try:
             patch = read_msh(replace(file, normals=False), {})
             return _with_reversed(mesh_mirrors(patch, vectors, loosely=loosely))
@@ -356,11 +360,11 @@ def _mesh_outline(shell: MeshSurface) -> Outline:
             return []
 
     return Outline(
-        lambda mirror, size: file,
-        space_embedding,
-        node_normals,
-        lambda x: x,
-        None,
+        chart=lambda mirror, size: file,
+        embedding=space_embedding,
+        normal=node_normals,
+        inverse=lambda x: x,  # a place stands for its chart
+        highest=None,
         mirrors=mirrors,
     )
 
@@ -382,11 +386,11 @@ def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
         return shells.patch.embedding(nodes)
 
     return Outline(
-        chart,
-        embedding,
-        node_normals,
-        lambda x: x,
-        None,
+        chart=chart,
+        embedding=embedding,
+        normal=node_normals,
+        inverse=lambda x: x,  # a place stands for its chart
+        highest=None,
         mirrors=shells.mirrors,
         meridian=meridian if isinstance(meridian, MeridianChart) else None,
         why_no_meridian=meridian if isinstance(meridian, str) else None,
@@ -403,11 +407,11 @@ def _strip_outline(width: float) -> Outline:
 
     # the mesher takes element sizes itself: `size` is for grids
     return Outline(
-        lambda mirror, size: StripShape(width, mirror is not None),
-        plane_embedding,
-        plane_normals,
-        inverse,
-        tip,
+        chart=lambda mirror, size: StripShape(width, mirror is not None),
+        embedding=plane_embedding,
+        normal=plane_normals,
+        inverse=inverse,
+        highest=tip,
         mirrors=lambda *_: [Y0_PLANE],
     )
 
@@ -436,10 +440,12 @@ def _disc_outline(
 
     Parameters
     ----------
-    edge
-        Radius of the disc.
-    embedding, normal, inverse
-        As those of `Outline`; `inverse` may lead beyond the edge.
+    edge, edge_name
+        Radius of the disc, and name of its edge.
+    embedding, normal
+        Chart (n, 2) -> places and outward unit normals (n, 3).
+    inverse
+        Place (3,) -> its chart (2,), which may be beyond the edge.
     sphere
         Whether chart distances from the origin are polar angles.
     curvature
@@ -460,15 +466,23 @@ def _disc_outline(
         """Return the meridian's parameter and the azimuth of a chart (2,)."""
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
 
-    meridian = MeridianChart(edge, (), (None, edge_name), embedding, normal, locate, curvature)
+    meridian = MeridianChart(
+        length=edge,
+        curvature_jumps=(),
+        names=(None, edge_name),
+        embedding=embedding,
+        normal=normal,
+        locate=locate,
+        curvature=curvature,
+    )
     return Outline(
-        chart,
-        embedding,
-        normal,
-        inverse_in_disc,
-        np.zeros(2),
-        edge,
-        sphere,
+        chart=chart,
+        embedding=embedding,
+        normal=normal,
+        inverse=inverse_in_disc,
+        highest=np.zeros(2),  # the pole
+        edge=edge,
+        sphere=sphere,
         round=True,
         meridian=meridian,
     )
@@ -491,7 +505,7 @@ def _ring_outline(
     first, last = shell.azimuth_range  # radians
     s = np.linspace(0, profile.length, PROFILE_SAMPLES, dtype=np.float64)
     rho = float(profile(s)[:, 0].max())
-    # whether the grid is closed around e3, and along the profile
+    # whether the grid is closed: around e3, and along the profile
     glued = shell.azimuth is None, shell.closed
     low, high = (first * rho, 0.0), (last * rho, profile.length)
     embedding = RevolvedEmbedding(profile, rho)
@@ -516,15 +530,15 @@ def _ring_outline(
     meridian = None
     if glued == (True, False):
         meridian = MeridianChart(
-            profile.length,
-            (),
-            (names[1], names[0]),
-            meridian_embedding,
-            meridian_normal,
-            locate,
-            _largest_curvature(profile),
+            length=profile.length,
+            curvature_jumps=(),
+            names=(names[1], names[0]),
+            embedding=meridian_embedding,
+            normal=meridian_normal,
+            locate=locate,
+            curvature=_largest_curvature(profile),
         )
-    # its element size, 1, is replaced when it is meshed
+    # the element size of 1 is replaced when the grid is meshed
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
     # the reported point is a corner of the chart: the first one if two sides are one line in space
     highest = np.array(low if any(glued) else high)
@@ -552,8 +566,18 @@ def _grid_outline(
 ) -> Outline:
     """Return the outline of a surface that is charted by a rectangle.
 
-    `grid` is the rectangle with the names of its edges and the sides that are glued together. Other
-    parameters are attributes of the outline.
+    Parameters
+    ----------
+    grid
+        The rectangle, with the names of its edges and the sides that are glued together.
+    embedding, normal
+        Chart (n, 2) -> places and outward unit normals (n, 3).
+    inverse
+        Place (3,) -> its chart (2,).
+    highest
+        Chart (2,) of the point whose displacement is reported where the case names none.
+    meridian
+        The meridian of a surface of revolution; None without one.
     """
 
     def chart(mirror: Mirror | None, grading: Grading) -> Chart:
@@ -566,14 +590,15 @@ def _grid_outline(
         return replace(grid, size=size, fixed_lines=fixed_lines)
 
     def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        # both parameters are for mesh files, and not used here
         return _with_reversed(grid_mirrors(grid, embedding))
 
     return Outline(
-        chart,
-        embedding,
-        normal,
-        inverse,
-        highest,
+        chart=chart,
+        embedding=embedding,
+        normal=normal,
+        inverse=inverse,
+        highest=highest,
         round=grid.glued[0],
         mirrors=mirrors,
         meridian=meridian,
@@ -583,9 +608,9 @@ def _grid_outline(
 def _sector_of_grid(grid: Grid, sector: Sector) -> Grid:
     """Return the part of a grid, closed around e3, between azimuths 0 and 180/m degrees.
 
-    It has at least four quadrilaterals around: lines at its quarters.
+    It has at least four quadrilaterals along the azimuth, as there are lines at its quarters.
     """
-    # copies of a sector: 2 m
+    # 2 m copies of a sector make the whole
     end = (grid.high[0] - grid.low[0]) / sector.copies
     quarters = tuple(end * fraction for fraction in (0.25, 0.5, 0.75))
     sides = (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE, *grid.sides[2:])

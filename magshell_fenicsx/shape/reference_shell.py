@@ -214,12 +214,12 @@ def _off_sphere_text(at: At, ground: ReferenceShell) -> str:
 
 
 def _place(at: At, ground: ReferenceShell, key: str) -> Array:
-    """Return the place (3,) of `locate`, with its parameters.
+    """Return the place (3,) over R of the perfect surface that a case means by `at`.
 
     Raises
     ------
     CaseError
-        As `locate`.
+        If the place does not lie on the surface, or a direction does not determine it.
     """
     perfect = ground.perfect
     if at.point is not None:

@@ -97,7 +97,8 @@ def common_mirror(
     outline
         The surface of the shell.
     loosely
-        Whether the triangles of a mesh file need not be symmetric; see `mesh_mirrors`.
+        Whether the triangles of a mesh file need not be symmetric, if areas and centres of both
+        halves are.
     """
     if any(part.mirrors is no_plane for part in parts):
         return None

@@ -13,7 +13,8 @@ with an amplitude is multiplied by it, and one without has the factor 1. A free 
 `group` and `column` of an energy name its group of terms and its column in reported energies. A
 field "in space" is an applied flux density known by its values at displaced places, as of a magnet;
 else the field is uniform or linear in space. The natural shape is the one without stress. A shell
-thins where its thickness follows from the deformation, as in rubber.
+thins where its thickness follows from the deformation, as in rubber. Facets are the sides of cells
+along an edge of the surface.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -159,6 +160,7 @@ class EnergyFactory:
             return make(FormTerm)
         if energy.reference_turn is None:
             return make(ShellTerm, energy.density)
+        # a moment on an edge does work on the turn since a reference turn
         moment = make(MomentTerm, energy.density)
         moment.set_reference_turn(*energy.reference_turn)
         return moment
@@ -336,6 +338,7 @@ class EnergyFactory:
         # `magnetic`, called before, added the field in space last
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
         law, *parameters = self._of_sheet(sheet, field.soft, applied)
+        # the volume over h is the integral of 1 over the area, weighted with the thickness
         by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
             by_name[axis] = Density(per_area(sheet.induced), (law, self._constant(e), *parameters))
@@ -387,6 +390,7 @@ class EnergyFactory:
         the susceptibility.
         """
         domain, followed = self.domain, (self.domain.r0, self.u)
+        # the coefficients of both polynomials at each quadrature point
         saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
         jets_at_points = domain.tables(domain.r0.function_space, saturation.points)
 
@@ -412,9 +416,10 @@ class EnergyFactory:
         (`field.energy`) is a sum of several energies, by name.
         """
         pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
-        full = full_density(field.law, thins=thins)
+        full = full_density(field.law, thins=thins)  # the exact density, in a uniform field
         Br = pattern_field(pattern, domain.r0)[0] if callable(pattern) else self._constant(pattern)
         if applied:
+            # the same density, with the field's value at the displaced place
             density = self._magnetised(
                 field, densities.in_space(full), Br, applied.polynomial, parts=VALUE_AND_FIRST
             )
@@ -423,6 +428,7 @@ class EnergyFactory:
         directions = [("lambda_m", "", field.applied)]
         for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False):
             directions.append((name, name.replace("lambda_", " "), Ba))
+        # name -> density, of the exact energy or of the parts of an approximate one
         chosen_densities = magnetic_densities(field.law, field.energy, thins=thins)
         energies = []
         for amplitude, suffix, Ba in directions:
@@ -534,7 +540,7 @@ class EnergyFactory:
             Amplitude in place of the term's name.
         """
         assert term.density  # a term without a density only observes
-        # parts of the jet that only the placement needs
+        # parts of the jet (such as "r" and "r1") that are needed of the placement but not of u
         reference_parts = tuple(part for part in term.placement_parts if part not in term.parts)
         density_function = _per_coordinates(term, term.at_point(term.density))
         parts = (*term.parts, *reference_parts)
@@ -599,6 +605,7 @@ class EnergyFactory:
             )
         else:
             density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
+        # pressure times the distance from the body's axis
         radius_function = radius_density(
             self._constant(contact.front), self._constant(contact.direction)
         )

@@ -42,17 +42,18 @@ def mass(model: Model) -> PETSc.Mat:
 
     Rows and columns at supports are zero.
     """
-    M, projection = mass_matrix(_product(model), model.system.clamped), model.system.projection
+    M, projection = mass_matrix(_mass_form(model), model.system.clamped), model.system.projection
+    # oblique supports hold directions that are no coordinates
     return projection.mass(M) if projection else M
 
 
 def mass_with_supports(model: Model) -> PETSc.Mat:
     """Return the consistent mass matrix with the rows and columns at supports; collective."""
-    return mass_matrix(_product(model), [])
+    return mass_matrix(_mass_form(model), [])
 
 
-def _product(model: Model) -> fem.Form:
-    """Return the compiled form of the mass."""
+def _mass_form(model: Model) -> fem.Form:
+    """Return the compiled form of the mass: the product of displacements, weighted with it."""
     factor = mass_factor(model)
     name = "mass" if factor is None else "weighted mass"
     return model.kernels.compile(
@@ -80,10 +81,11 @@ def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
 def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """Return the form of the weighted product of two waves with coefficients (U + V, V, W).
 
-    It does not depend on the wave number m >= 1: the mean of cos² and of sin² around e3 is 1/2,
-    their integral pi. The jets' value has no m, so that m = 1 stands for all.
+    It does not depend on the wave number m >= 1, since cos² and sin² have the integral pi around
+    e3. Only values of the waves count, which do not depend on m either: m = 1 stands for all.
     """
     V = model.waves.V
+    # jets of both waves: of the coefficients of the cosine, then of the sine
     cosine, sine = zip(
         *(domains.wave_jets(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True
     )
@@ -106,6 +108,7 @@ def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
     direction = fem.Function(V, name="phi")
     direction.x.array[: len(phi)] = phi
     direction.x.scatter_forward()
+    # phi in place of both arguments of the product
     energy = ufl.replace(product, dict.fromkeys(product.arguments(), direction))
     name = "mass along a displacement" if wave is None else "mass along a wave"
     return FormTerm(name, energy, model.system.u, model.kernels, linear=True)
@@ -160,6 +163,14 @@ class SupportInertia:
     ----------
     names
         Amplitudes of the motions.
+    _system, _mass
+        The parameters.
+    _moving
+        Prescribed motion of the system's supports, with its derivatives by the amplitudes.
+    _at, _carried
+        The parameters `amplitudes_at` and `first_velocity`.
+    _x, _y
+        A vector and its product with the mass, filled again at each product.
     """
 
     def __init__(
@@ -195,14 +206,17 @@ class SupportInertia:
         `is_before` takes the limit from before a kink.
         """
         mu, rates = self._at(t, is_before)
-        # E'' = dE/dmu mu'' + d2E/dmu_a dmu_b mu_a' mu_b', with rates (mu', mu'') of each motion
+        # E'' = dE/dmu mu'' + d2E/dmu_a dmu_b mu_a' mu_b', with rates (mu', mu'') of each motion;
+        # `rate` is the first and `bend` the second derivative of E by amplitudes
         from_second_rates = self._sum(
             second_rate * self._moving.rate(mu, name) for name, (_, second_rate) in rates.items()
         )
+        # pairs of motions, with the product of their first rates
         pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
-        return from_second_rates + self._sum(
+        from_first_rates = self._sum(
             product * self._moving.bend(mu, a, b) for a, b, product in pairs
         )
+        return from_second_rates + from_first_rates
 
     def displacement_rate(self, mu: Amplitudes, name: str) -> Vector:
         """Return dE/dmu (local size,) of the motion `name`."""

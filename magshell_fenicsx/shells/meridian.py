@@ -145,8 +145,27 @@ class MeridianModel(ThinModel):
 
     Attributes
     ----------
-    system, multiplicity, normals, supports
-        See `ModelBase`; u = (U, W) along e_rho and e_z.
+    system
+        The equations that solvers take, for u = (U, W) along e_rho and e_z.
+    multiplicity
+        1: the model is the whole shell.
+    normals
+        n0 (3,) at the named points.
+    supports
+        Name of an end -> its support.
+    loads, load_size, load_sizes
+        All that loads the model; by amplitude, the sum of the sizes of its dead loads over E h R,
+        as a number and as forms.
+    V, r0, u
+        Space of the displacement; placement and displacement over R.
+    factory
+        Factory that makes the energies.
+    fields
+        Applied fields that are known by their values.
+    without_potential
+        Ends at which a live pressure has no potential.
+    growing
+        The placement with amplitudes of growing imperfections; None without.
     held
         Supports of the axis and the ends.
     energies
@@ -159,6 +178,10 @@ class MeridianModel(ThinModel):
         `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
     shell_contacts, t_junction_terms
         The contacts of shells with each other, and their T-junctions.
+    _volume
+        Compiled form of Delta V/R^3.
+    _probe_by_point
+        Name of a point -> `Probe` that gives the displacement there.
     """
 
     shell_contacts: "Sequence[MeridianContact]"
@@ -230,7 +253,7 @@ class MeridianModel(ThinModel):
     def _make_factory(self) -> EnergyFactory:
         """Return the factory that makes the energies of this shell.
 
-        `loads` gets the natural shape cell by cell.
+        `self.loads` gets the natural shape cell by cell.
         """
         meridian, loads = self.meridian, self.loads
         pressed_cells = side_field(loads.pressed_sides, meridian) if loads.pressed_sides else None
@@ -315,7 +338,7 @@ class MeridianModel(ThinModel):
             energy = pole_force(name, force, self.force_unit, measures, self.kernels)
             self.energies.append(energy)
         for name, dead in self.loads.dead.items():
-            if forces(dead):
+            if forces(dead):  # else there are moments alone, whose energies come below
                 energy, size, sizes = dead_loads(name, dead, measures, self.kernels)
                 self.load_size[name], self.load_sizes[name] = size, sizes
                 self.energies.append(energy)
@@ -330,8 +353,10 @@ class MeridianModel(ThinModel):
         # a pressure does work on the volume that the surface sweeps
         has_swept_volume = loads.pressure or is_enclosed
         volume = factory.swept_volume() if has_swept_volume else factory.volume_change(np.zeros(3))
+        # terms, of which that of interior edges gives the sparsity pattern
         terms = [factory.term(energy) for energy in self.energies]
         pattern_term = next(term for term in terms if term.name == INTERIOR)
+        # parameters of energies that may vary, by name
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, terms, self.u, self.kernels)
         }
@@ -398,10 +423,11 @@ class MeridianModel(ThinModel):
         return meridian_t_junction_terms(self)
 
     def numbers(self) -> dict[str, list[Array]] | None:
-        """Return all values that the terms take from the problem: term name -> arrays, as views.
+        """Return all values that the terms take from the problem, by the names of terms.
 
-        "placement" has the nodal values of r0. None if the terms depend on more than such values,
-        as with contact or moving supports. Then the forms cannot serve another problem.
+        The arrays are views, so that they can be set. The name "placement" has the nodal values of
+        r0. None if the terms depend on more than such values, as with contact or moving supports.
+        Then the forms cannot serve another problem.
         """
         # terms with data that follow the state
         follows_state = (
@@ -416,7 +442,7 @@ class MeridianModel(ThinModel):
         has_other_numbers = any(e.density is None or e.reference_turn for e in self.energies)
         if follows_state or has_other_numbers:
             return None
-        # amplitudes are not numbers of the problem
+        # free constants have amplitudes as values, which are not numbers of the problem
         free_constants = {id(constant) for constant in self.factory.free_constants.values()}
         values_by_term = {"placement": [self.r0.x.array]}
         for e in self.energies:
@@ -459,7 +485,7 @@ class MeridianModel(ThinModel):
 
     @property
     def waves(self) -> Waves:
-        """Around the axis."""
+        """Waves around the axis, and the second variation along them."""
         return self.symmetry_breaking_modes.waves
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
@@ -485,10 +511,11 @@ class MeridianModel(ThinModel):
         axisymmetric; turns about e3 are waves m = 0, motions across e3 waves m = 1.
         """
         state, comm = State(self.zero(), dict(amplitudes)), self.V.mesh.comm
+        # motions of a shell that nothing holds: along e3, about e3 and across it
         motions = self.held.rigid_motions(self.r0)
 
         def unresisted_waves(waves: Array, m: int) -> Array:
-            """Return the waves m (n, unknowns) that neither supports nor energy resist."""
+            """Return the motions that neither supports nor energy resist, of waves m (n, size)."""
             with_zeros = partial(_with_zeros, self.held.unknowns_of_waves(self.r0, m))
             return unresisted(waves, with_zeros, lambda: self.waves.tangent(state, m), comm)
 
@@ -504,7 +531,7 @@ class MeridianModel(ThinModel):
         if len(motions.axial):
             return NOT_HELD + "move along (0, 0, 1)"
         if len(motions.transverse):
-            # [2::3]: coefficients W; a translation across the axis has none
+            # [2::3]: coefficients W; a translation across the axis has none, a turn has
             turns_alone = (
                 len(motions.transverse) == 1
                 and np.abs(motions.transverse[0][2::3]).max() > AXIAL_TOLERANCE
@@ -517,7 +544,7 @@ class MeridianModel(ThinModel):
         return self._probe_by_point[point](u)
 
     def probe(self, point: str) -> Array:
-        """Return rows (3, size) that give the displacement at a named point, see `ModelBase`."""
+        """Return the matrix (3, size) that maps u to the displacement of a named point."""
         return self._probe_by_point[point].rows(self.system.size)
 
     def _edge_pressure(self) -> EdgePressure:
@@ -526,6 +553,7 @@ class MeridianModel(ThinModel):
         Ends of shells without pressure have none. A lid is a disc of the end's radius, whose normal
         continues the pressed side.
         """
+        # parameter s of each end
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
             Lid.disc(
@@ -534,6 +562,7 @@ class MeridianModel(ThinModel):
                 last=(side > 0) != self.meridian.begins(name),
             )
             for name, s in ends.items()
+            # 1: pressed from outside, -1: from inside, 0: not pressed
             if (side := side_of(name, self.loads.pressed_sides))
             and (motions := motions_of(self.loads, name))
         ]

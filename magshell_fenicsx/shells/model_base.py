@@ -69,20 +69,21 @@ class ModelBase:
         All that loads the model.
     load_size, load_sizes
         By amplitude, the sum of the sizes of its dead loads over E h R, and that sum as forms,
-        which depend on the placement; see `DeadLoads`.
+        which depend on the placement.
     kernels
         Log that compiles forms.
     supports
         Name of an edge, point or patch -> its support.
     without_potential
-        Names of the edges at which a live pressure has no potential; see `openings`.
+        Names of the edges at which a live pressure has no potential.
     fields
         Applied fields that are known by their values.
     observed
-        Column -> form over the modelled part, of terms (see `OwnTerm.observed`) and of the
+        Column -> form over the modelled part, of what the user's terms observe and of the
         polarisation that a field induces.
     contacts
-        Approach of a body -> the state of its contact, and the integrals of its pressure.
+        Approach of a body -> the state of its contact, and the forms of the integrals of its
+        pressure: "pressure", and "radius" with the distance from the axis as weight.
     shell_contacts
         The contacts of parts of the shell with each other, or with itself.
     planes
@@ -95,6 +96,10 @@ class ModelBase:
         Factor (1,) of a shell's thickness; None for 1, and for a solid, which has it in its shape.
     midsurface
         The mesh of a mid-surface; None for a meridian or a solid.
+    _volume
+        Form of Delta V/R^3 of the modelled part.
+    _probes
+        Name of a vertex -> its three unknowns, on the rank that owns it; empty on other ranks.
     """
 
     system: FiniteElementSystem
@@ -154,19 +159,28 @@ class ModelBase:
             for all cells.
         """
         self._volume = volume
-        # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
-        self._probes = {
-            # only the degrees of freedom count; any direction without zeros gives all three
-            name: point_entries(V, x, np.ones(3), cells_at_point and cells_at_point(name))[0]
-            for name, x in points.items()
-        }
+        probes = {}
+        for name, x in points.items():
+            cells = cells_at_point and cells_at_point(name)
+            # unknowns on which a force at the vertex acts; any direction without zeros gives all
+            # three of them
+            unknowns, _ = point_entries(V, x, np.ones(3), cells)
+            probes[name] = unknowns
+        self._probes = probes
 
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
         """Return the term of an amplitude's dead loads, without its moments.
 
-        `dead` are the assembled loads. Those spread over surfaces and edges also give forms, for
-        derivatives by the placement. Also sets `load_size` and `load_sizes` of the amplitude.
+        Also sets `load_size` and `load_sizes` of the amplitude.
+
+        Parameters
+        ----------
+        name
+            The amplitude.
+        dead
+            The assembled loads. Those spread over surfaces and edges also give forms, for
+            derivatives by the placement.
         """
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
         unity, u = fem.Constant(self.V.mesh, 1.0), self.u
@@ -193,7 +207,7 @@ class ModelBase:
         ]
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
-        """Return a message that names a rigid motion left free, else empty; collective."""
+        """Return a message that names a rigid motion left free; "" if there is none; collective."""
         return free_motion(self.system, self.r0, amplitudes)
 
     def zero(self) -> Vector:
@@ -254,6 +268,7 @@ class ModelBase:
         body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def pressure_of_cells() -> Array:
+            """Return the sum over all contacts in each cell, at the system's state."""
             pressures = [body_contact.cell_pressures() for body_contact in body_contacts]
             for contact in self.shell_contacts:
                 cell_pressures, _, _ = contact.cell_pressures_and_gaps()
@@ -265,12 +280,12 @@ class ModelBase:
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
         """Return a mask (cells,) of the local cells that a contact presses evenly.
 
-        There the cell's mean, `cell_pressures`, stands for the pressure; see
-        `BodyContact.evenly_pressed`.
+        There the mean over the cell, as `cell_pressures` gives it, stands for the pressure.
         """
         body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
+            """Return whether any contact presses each cell evenly, at the system's state."""
             flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
             for contact in self.shell_contacts:
                 _, _, is_evenly_pressed = contact.cell_pressures_and_gaps()
@@ -289,6 +304,7 @@ class ModelBase:
             return None
 
         def gaps_of_cells() -> Array:
+            """Return the least gap over all contacts in each cell, at the system's state."""
             gaps = []
             for contact in self.shell_contacts:
                 _, cell_gaps, _ = contact.cell_pressures_and_gaps()
@@ -324,6 +340,8 @@ class ThinModel(ModelBase):
     ----------
     factory
         Factory that made the energies.
+    kernels
+        Log that compiles forms.
     """
 
     factory: EnergyFactory
@@ -341,6 +359,7 @@ class ThinModel(ModelBase):
             Edge name -> its facets.
         """
         factory = self.factory
+        # facets on which a term acts; None for the whole surface
         terms_and_facets = [
             (term, edges[term.on] if term.on else None) for term in self.loads.user_terms
         ]
@@ -354,6 +373,7 @@ class ThinModel(ModelBase):
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}
         for contact in self.loads.contacts:
+            # energy, state of the contact, and forms of the integrals of its pressure
             energy, body_contact, integrals = factory.contact(contact)
             energies.append(energy)
             self.contacts[contact.amplitude] = body_contact, self.kernels.compile_all([integrals])

@@ -39,6 +39,7 @@ from magshell_fenicsx.shells.mass import (
 )
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
+from magshell_fenicsx.shells.waves import Waves
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 # beginnings of labels of modes that a reduced model does not see
@@ -107,9 +108,11 @@ class _Family:
     Attributes
     ----------
     label
-        As of `ShellMode`.
+        Label of its modes: "", "antisymmetric", "torsion", or "m = 7".
     tangent
         Function from a state to its tangent.
+    constraints
+        Conditions of its displacements.
     product
         Name and form of the inner product.
     projection
@@ -141,7 +144,9 @@ class ShellModes:
     Attributes
     ----------
     model
-        The model; of a sector, see `mode_space`.
+        The model; of a sector, that of its half, which `mode_space` gives.
+    _products
+        Name of an inner product -> its compiled form.
     """
 
     model: Model
@@ -169,7 +174,7 @@ class ShellModes:
         Raises
         ------
         ModesNotFound
-            See `continuation.modes.lowest_modes`.
+            If the iteration for the eigenvalues does not find them.
         """
         return self._lowest(
             _families(self.model, rest=state if allows_rigid_motion else None), state, count
@@ -182,19 +187,28 @@ class ShellModes:
 
         Eigenvalues are omega^2 rho R^2/E. The mass is consistent, without rotary inertia, and that
         of the undeformed shell. On the meridian vibrations around the axis are among them.
-        Arguments are those of `lowest`.
+
+        Parameters
+        ----------
+        state
+            Equilibrium whose tangent is taken.
+        count
+            Number of modes.
+        allows_rigid_motion
+            Whether the state is the undeformed one of a shell that nothing holds, whose rigid
+            motions are then among the modes.
 
         Raises
         ------
         ModesNotFound
-            See `continuation.modes.lowest_modes`.
+            If the iteration for the eigenvalues does not find them.
         """
-        lowest = self._lowest(
-            _families(self.model, vibrating=True, rest=state if allows_rigid_motion else None),
-            state,
-            count,
+        families = _families(
+            self.model, vibrating=True, rest=state if allows_rigid_motion else None
         )
-        return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
+        modes = self._lowest(families, state, count)
+        unstable_count = sum(mode.eigenvalue < 0 for mode in modes)
+        return modes[: max(count, unstable_count)]
 
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
         """Return the lowest `count` modes of each family, ascending over all families.
@@ -206,8 +220,9 @@ class ShellModes:
             M = mass_matrix(self._product(family), family.constraints)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
-            # The first modes are the rigid motions. Those of torsion are left out, since the motion
-            # along the axis is among them: `motions` has the others.
+            # The first `family.rigid` modes are rigid motions, in any combination. In the family of
+            # torsion the motion along the axis is among them, which is none of its modes. So they
+            # are left out there, and `family.motions` has those around the axis.
             if family.contains is _turns:
                 modes = modes[family.rigid :]
             shell_modes += [
@@ -234,7 +249,7 @@ class ShellModes:
         Raises
         ------
         ModesNotFound
-            See `continuation.modes.null_vector`.
+            If the iteration does not find it.
         """
         # "" is the label of the model's own family
         label = label if label.startswith(SYMMETRY_BREAKING_LABELS) else ""
@@ -264,44 +279,20 @@ def _families(
         Undeformed state of a shell that nothing holds, whose rigid motions are counted; else None.
     """
     mass_weight = mass_factor(model) if vibrating else None
-    factor, name = (1.0, "") if mass_weight is None else (mass_weight, "weighted ")
-    mass = f"{name}mass", displacement_product(model, factor)
-
-    def family_of_system(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
-        """Return the family of all modes of a system, of which `rigid` are rigid motions."""
-        return _Family(
-            label,
-            lambda state: system.tangent(state.u, state.mu),
-            system.clamped,
-            mass,
-            system.projection,
-            rigid=rigid,
-        )
-
+    factor, prefix = (1.0, "") if mass_weight is None else (mass_weight, "weighted ")
+    mass = f"{prefix}mass", displacement_product(model, factor)  # name and form
     if isinstance(model, MeridianModel):
         free_motions = model.rigid_motions(rest.mu) if rest else None
-        if free_motions:
-            axial_count, transverse_count = (len(free_motions.axial), len(free_motions.transverse))
-        else:
-            axial_count, transverse_count = (0, 0)
-        torsions: list[Vector] = [*free_motions.torsional] if free_motions else []
-        yield family_of_system("", model.system, axial_count)
+        axial_count = len(free_motions.axial) if free_motions else 0
+        yield _family_of_system("", model.system, mass, axial_count)
         waves = model.symmetry_breaking_modes.waves
-        wave_mass = f"{name}wave mass", wave_product(model, factor)
+        wave_mass = f"{prefix}wave mass", wave_product(model, factor)
         if vibrating:
-            yield _Family(
-                TORSION,
-                partial(waves.tangent, m=0),
-                waves.constraints(0),
-                wave_mass,
-                contains=_turns,
-                # waves m = 0 also have the meridian's own motion along e3
-                rigid=len(torsions) + axial_count,
-                motions=torsions,
-            )
+            torsions = [*free_motions.torsional] if free_motions else []
+            yield _family_of_torsion(waves, wave_mass, torsions, axial_count)
         for m in range(1, waves.largest + 1):
             # motions across the axis are waves m = 1
-            rigid = transverse_count if m == 1 else 0
+            rigid = len(free_motions.transverse) if free_motions and m == 1 else 0
             yield _Family(
                 f"m = {m}",
                 partial(waves.tangent, m=m),
@@ -315,10 +306,53 @@ def _families(
         """Return the number of rigid motions that nothing in a system holds, at rest."""
         return rigid_motions(system, model.r0, rest.mu) if rest else 0
 
-    yield family_of_system("", model.system, free_motion_count(model.system))
+    yield _family_of_system("", model.system, mass, free_motion_count(model.system))
     if isinstance(model.symmetry_breaking_modes, AntisymmetricModes):
         antisymmetric = model.symmetry_breaking_modes.system
-        yield family_of_system("antisymmetric", antisymmetric, free_motion_count(antisymmetric))
+        rigid = free_motion_count(antisymmetric)
+        yield _family_of_system("antisymmetric", antisymmetric, mass, rigid)
+
+
+def _family_of_system(
+    label: str, system: FiniteElementSystem, mass: tuple[str, ufl.Form], rigid: int
+) -> _Family:
+    """Return the family of all modes of a system, of which `rigid` are rigid motions.
+
+    `mass` is the name and the form of the inner product.
+    """
+    return _Family(
+        label,
+        lambda state: system.tangent(state.u, state.mu),
+        system.clamped,
+        mass,
+        system.projection,
+        rigid=rigid,
+    )
+
+
+def _family_of_torsion(
+    waves: Waves, mass: tuple[str, ufl.Form], torsions: Sequence[Vector], axial_count: int
+) -> _Family:
+    """Return the family of vibrations around the axis, which are waves m = 0.
+
+    Parameters
+    ----------
+    mass
+        Name and form of the inner product of waves.
+    torsions
+        Rigid turns about the axis that nothing holds.
+    axial_count
+        Number of rigid motions along the axis that nothing holds; waves m = 0 have these, too.
+    """
+    return _Family(
+        TORSION,
+        partial(waves.tangent, m=0),
+        waves.constraints(0),
+        mass,
+        contains=_turns,
+        rigid=len(torsions) + axial_count,
+        motions=torsions,
+    )
 
 
 def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
@@ -332,7 +366,8 @@ def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
 def _turns(coefficients: Vector) -> bool:
     """Return whether a wave m = 0, with coefficients (P, V, W), turns around the axis.
 
-    Other waves m = 0 are displacements of the meridian itself.
+    Then V is its largest part. Other waves m = 0 are displacements of the meridian itself. P is
+    U + V.
     """
     P, V, W = coefficients.reshape(-1, 3).T
     return bool(V @ V > (P - V) @ (P - V) + W @ W)

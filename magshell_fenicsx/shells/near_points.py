@@ -38,9 +38,11 @@ def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
     names |= {load.point for load in loads.all_dead if isinstance(load, PointForce)}
     ordered = sorted(names)  # the same order on all ranks
     if model.axisymmetric:
-        # the parameter alone, without the azimuth
-        at = {name: model.meridian.points[name][:1] for name in ordered}
-        return {name: model.meridian.section(np.array(s))[0] for name, s in at.items()}
+        places = {}
+        for name in ordered:
+            parameter = model.meridian.points[name][:1]  # without the azimuth that comes second
+            places[name] = model.meridian.section(np.array(parameter))[0]  # (rho, z)
+        return places
     surface = model.midsurface if model.thin else None
     return {name: surface.points[name] for name in ordered} if surface else {}
 
@@ -56,7 +58,7 @@ def point_of_mode(
     Parameters
     ----------
     places
-        See `places_of_point_forces`.
+        Undeformed places of all point forces by name, as `places_of_point_forces` gives them.
     mode
         This rank's part of a displacement. With `waves` it holds the coefficients (U + V, V, W) of
         that number of waves around the axis.
@@ -66,9 +68,9 @@ def point_of_mode(
     comm = model.system.comm if not model.axisymmetric else None
 
     def total(values: Array) -> float:
-        """Return the sum over all ranks."""
-        mine = float(values.sum())
-        return float(comm.allreduce(mine)) if comm else mine
+        """Return the sum of all values of all ranks."""
+        of_rank = float(values.sum())
+        return float(comm.allreduce(of_rank)) if comm else of_rank
 
     whole_square = total(squares)
     for name, place in places.items():
@@ -101,12 +103,15 @@ def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Arr
     nodes, shapes = V.dofmap.list[:owned], element.tabulate(1, X)[..., 0]
 
     def jets(values: Array) -> Array:
-        """(1 + dim, cells, points, components) of values at nodes: value, then derivatives."""
+        """Return the value at points, then its derivatives, of values (nodes, components) at nodes.
+
+        The shape is (1 + dim, cells, points, components).
+        """
         return np.asarray(np.einsum("dqn,cni->dcqi", shapes, values[nodes]))
 
     r = jets(model.r0.x.array.reshape(-1, V.dofmap.bs))  # of the undeformed places
     if model.axisymmetric:
-        v = jets(_wave_at_nodes(mode, model.system.size, waves))
+        v = jets(_wave_at_nodes(mode, model.system.size, waves))  # coefficients U, V and W
         return r[0], _squares_on_meridian(r, v, waves or 0) * weights
     v = jets(model.system.with_ghosts(mode[: model.system.size]).reshape(-1, 3))
     # |grad v|² = g^ab v,_a . v,_b
@@ -137,7 +142,8 @@ def _squares_on_meridian(r: Array, v: Array, m: int) -> Array:
     # speed: length of the meridian per reference coordinate
     rho, speed = r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
     U, V, W = np.moveaxis(v[0], -1, 0)
-    # squares of the derivatives by theta: coefficient of cos along e_theta, of sin along e_rho, e_z
+    # square of the derivative by theta, which is (U + m V) cos along e_theta, -(m U + V) sin along
+    # e_rho and -m W sin along e_z
     around = (U + m * V) ** 2 + (m * U + V) ** 2 + (m * W) ** 2
     along = np.sum(v[1] ** 2, axis=-1)
     # the factor of the whole turn is left out: it is the same everywhere

@@ -44,6 +44,8 @@ class Revolution:
         (n, 3) undeformed placement and unit normal, lengths in R.
     cells
         (m, 3) node numbers of triangles with the outer side up.
+    _model
+        The parameter `model`.
     _at_ends
         (2, circles) a cell that has each circle at an end, and this end's number, 0 or 1.
     _poles
@@ -96,7 +98,11 @@ class Revolution:
         return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
-        """Return the jets (6, cells, q, 3) of a field at reference points (q, 1); see `jets`."""
+        """Return the jets (6, cells, q, 3) of a field at reference points (q, 1) of all cells.
+
+        `f` has components (U, W). Jets are the value and the first and second derivatives, along
+        (e_rho, e_theta, e_z). No point may be on the axis.
+        """
         return _revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
@@ -124,11 +130,10 @@ class Revolution:
         The shape is (3, cells, q, components), in the order of cells along the meridian.
         """
         V = f.function_space
-        cells, bs = V.dofmap.list, V.dofmap.bs
+        nodes_of_cells, components = V.dofmap.list[self.order], V.dofmap.bs
         table = V.element.basix_element.tabulate(2, points)[:, :, :, 0]
-        return np.asarray(
-            np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[self.order]])
-        )
+        nodal_values = f.x.array.reshape(-1, components)[nodes_of_cells]
+        return np.asarray(np.einsum("dvk,cki->dcvi", table, nodal_values))
 
     def on_parallels(self, ends: Array, weight: Array) -> Array:
         """Return values (n, ...) at the nodes from values at the ends of all cells.
@@ -141,14 +146,13 @@ class Revolution:
         weight
             (cells, 2) weight of a cell's value in the mean over the two cells that meet.
         """
-        means = self._means(ends, weight)
+        means = self._means(ends, weight)  # one value for each circle
         circles = np.repeat(means[:, None], len(self._basis), axis=1)
-        # from components along (e_rho, e_theta, e_z) to those in space, at each sector; a vector at
-        # a pole has no direction but e_z
-        if means.ndim == 2:
+        # from components along (e_rho, e_theta, e_z) to those in space, at each sector
+        if means.ndim == 2:  # vectors
             circles = (circles[:, :, None] @ self._basis)[:, :, 0]
-            circles[self._poles] *= [0.0, 0.0, 1.0]
-        elif means.ndim == 3:
+            circles[self._poles] *= [0.0, 0.0, 1.0]  # a pole has no direction but e_z
+        elif means.ndim == 3:  # tensors
             circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
         return self.at_nodes(circles)
 
@@ -157,9 +161,10 @@ class Revolution:
 
         `ends` are values (cells, 2, ...) at their ends, `weight` is (cells, 2).
         """
-        weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
+        weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))  # one for all components
 
         def sums(values: Array) -> Array:
+            """Return the sum of values (cells, 2, ...) at each circle."""
             total = np.zeros((len(self._poles), *values.shape[2:]))
             np.add.at(total, self.ends, values)
             return total
@@ -168,12 +173,12 @@ class Revolution:
 
     def _swept(self, nodal: Array) -> Array:
         """Return vectors (n, 3) at the nodes from (rho, z) components at the meridian's nodes."""
-        components = nodal[self.vertices(self._model.V)]
+        components = nodal[self.vertices(self._model.V)]  # (circles, 2)
         # on the axis there is no component along e_rho
         components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]
-        return self.at_nodes(
-            components[:, :, :1] * self._basis[:, 0] + components[:, :, 1:] * self._basis[:, 2]
-        )
+        # vectors (circles, sectors, 3)
+        e_rho, e_z = self._basis[:, 0], self._basis[:, 2]
+        return self.at_nodes(components[:, :, :1] * e_rho + components[:, :, 1:] * e_z)
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
         """Return the node numbers (m, 3) of the triangles.
@@ -205,12 +210,14 @@ def _revolved(values: Array) -> Array:
     """
     (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values, -1, 1)
     o = np.zeros_like(U)
+    # value; derivatives by s and by theta; second derivatives by ss, by s theta, by theta theta
     jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]
     return np.stack([np.stack(v, axis=-1) for v in jet])
 
 
 def nodal_normals(r0: fem.Function) -> Array:
     """Return unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
-    normals = np.zeros((len(r0.x.array) // 2, 3))
-    np.add.at(normals, r0.function_space.dofmap.list, positions_and_normals(r0)[1])
-    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
+    sums = np.zeros((len(r0.x.array) // 2, 3))
+    _, normals_of_cells = positions_and_normals(r0)  # at the nodes of each cell
+    np.add.at(sums, r0.function_space.dofmap.list, normals_of_cells)
+    return np.asarray(sums / np.linalg.norm(sums, axis=1)[:, None])

@@ -52,6 +52,8 @@ class SectorModes:
 
     Attributes
     ----------
+    _model, _as_half
+        The parameters.
     _folding
         The map between charts of the half and of the sector; set with `half_model`, as are the two
         below.
@@ -80,16 +82,19 @@ class SectorModes:
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
         comm = self._model.system.comm
+        # mesh of the copies, both of whose outer edges lie on the half's plane, and model on it
         self._folding = unfolding_of(sector, patch)
         patch_of_half = unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE))
         half = self._as_half(distribute(patch_of_half, comm))
         chart_of_half = half.chart()
-        # charts of all ranks' nodes, in the order in which `unfold` gathers displacements
-        nodes = np.concatenate(comm.allgather(self._model.chart()))
-        # node of the sector and rotation that give the displacement of each node of the half
-        _, self._numbers = scipy.spatial.cKDTree(nodes).query(
+        # charts of all ranks' nodes of the sector, in the order in which `unfold` gathers
+        # displacements
+        chart_of_sector = np.concatenate(comm.allgather(self._model.chart()))
+        # for each node of the half the node of the sector that has its displacement
+        _, self._numbers = scipy.spatial.cKDTree(chart_of_sector).query(
             self._folding.to_sector(chart_of_half)
         )
+        # and the rotation from there, that of the copy in which the node is
         turns_of_copies = np.array([self._folding.turn(k) for k in range(sector.waves)])
         self._turns = turns_of_copies[self._folding.copies(chart_of_half)]
         return half
@@ -108,17 +113,19 @@ class SectorModes:
         modes antisymmetric to the half.
         """
         half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
-        # those of the half without those of the sector itself
+        # symmetric modes: those of the half without those of the sector itself
         self._own.factor(self._model.system.tangent(state.u, state.mu))
         sector_pivots = self._own.negative_pivots
         self._others.factor(half.system.tangent(state_of_half.u, state_of_half.mu))
         symmetric = self._others.negative_pivots - sector_pivots
+        # antisymmetric modes
         modes = half.symmetry_breaking_modes
         assert isinstance(modes, AntisymmetricModes)
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
         # The turn v of the whole shape about e3 is neutral and left out: the tangent K has one
-        # unstable mode less on the complement of v if v . K^-1 v is negative.
+        # unstable mode less on the complement of v if v . K^-1 v is negative. v is None where the
+        # shape cannot turn freely.
         turning = self._turning(state_of_half)
         if turning is not None and dot(half.system.comm, turning, factors.solve(turning)) < 0:
             antisymmetric -= 1
@@ -140,8 +147,10 @@ class SectorModes:
         if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
             return None
         V = half.V
+        # displacements and places (nodes, 3)
         u, r0 = system.with_ghosts(state.u, state.mu).reshape(-1, 3), half.r0.x.array.reshape(-1, 3)
         dofs, element = V.dofmap.list, V.element.basix_element
+        # derivatives of both by the reference coordinates, at the nodes of each cell
         table = element.tabulate(1, element.points)[1:, :, :, 0]
         tangents, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
         # change of places per radian about e3
@@ -152,7 +161,7 @@ class SectorModes:
             metric, np.einsum("nqdi,nqi->nqd", tangents, rotation)[..., None]
         )[..., 0]
         by_angle = np.einsum("nqd,nqdi->nqi", components, du)
-        # at nodes the mean over the cells that meet
+        # mean at each node over the cells that meet there
         sums = np.zeros_like(u)
         count = np.zeros(len(u))
         np.add.at(sums, dofs, by_angle)

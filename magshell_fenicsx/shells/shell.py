@@ -127,8 +127,24 @@ class ShellModel(ThinModel):
 
     Attributes
     ----------
-    system, multiplicity, normals, loads, load_size, supports
-        See `ModelBase`.
+    system
+        The equations that solvers take.
+    multiplicity
+        Number of modelled parts that make the shell: 2 for a half, 2 m for a sector, else 1.
+    normals
+        n0 (3,) at the named points.
+    loads
+        All that loads the model, with functions on the mesh in place of formulas.
+    load_size, load_sizes
+        By amplitude, the sum of the sizes of its dead loads over E h R, and that sum as forms.
+    supports
+        Name of an edge, point or patch -> its support.
+    V, r0, u
+        Space of the displacement; placement and displacement over R.
+    shell_contacts
+        The contacts of parts of the shell with each other, or with itself.
+    fields
+        Applied fields that are known by their values.
     factory
         Factory that made the energies.
     kernels
@@ -150,8 +166,14 @@ class ShellModel(ThinModel):
         All symmetry planes on which edges lie, those of the modelled part first.
     without_potential
         Edges at which a live pressure has no potential.
+    _arguments
+        Arguments of the constructor after the mid-surface, without the mirror.
+    _conditions
+        The parameter `conditions`.
     _mirror_planes
         Edge with the condition "symmetry" -> its plane.
+    _mirrored_facets
+        Local facets of all these edges, sorted.
     _mirror_term, _pattern_term
         Term of the edges on the last of these planes, and the term of interior edges, which gives
         the sparsity pattern.
@@ -177,7 +199,7 @@ class ShellModel(ThinModel):
         thickness: Thickness | None = None,
         mirror: Mirror = Y0_PLANE,
     ) -> None:
-        # the order below matters: placement, loads on the mesh, factory, terms, system
+        """Make placement, loads on the mesh and factory, then terms and system, in this order."""
         self._arguments = material, degree, conditions, loads, sigma, thickness
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         loads = _magnetisation_by_cell(loads, midsurface)
@@ -194,7 +216,7 @@ class ShellModel(ThinModel):
         self.kernels = KernelLog()
         self.V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(self.V), fem.Function(self.V, name="u")
-        cells = cell_geometry(self.r0)
+        cells = cell_geometry(self.r0)  # in which fields are projected onto polynomials
         self._refuse_normal_plies()
         self.loads = self._with_functions(loads, cells)
         self._put_edges_in_planes()
@@ -206,50 +228,58 @@ class ShellModel(ThinModel):
                 material.shells, midsurface.mesh, midsurface.patches
             )
         self.factory = self._make_factory(cells)
-        self._pattern_term = self.factory.term(self.factory.interior_edges())
+        self._assemble()
+
+    def _assemble(self) -> None:
+        """Make all terms of the factory's energies, and the system; collective.
+
+        Sets the attributes of the model that come with terms and supports.
+        """
+        factory, midsurface = self.factory, self.midsurface
+        # elastic energies
+        self._pattern_term = factory.term(factory.interior_edges())
         terms: list[Term] = [
-            self.factory.term(self.factory.membrane()),
-            self.factory.term(self.factory.bending()),
+            factory.term(factory.membrane()),
+            factory.term(factory.bending()),
             self._pattern_term,
         ]
+        # supports, with energies of clamped edges and of edges on mirror planes
         supports = ShellSupports(
             self.r0,
             midsurface,
-            conditions,
+            self._conditions,
             self._mirror_planes,
-            material.laminate_by_shell,
+            self.material.laminate_by_shell,
             self.loads,
-            self.factory,
+            factory,
         )
         terms += supports.terms
         self._mirror_term, self._constraints = supports.mirror_term, supports.constraints
         self.supports, self.planes = supports.by_name, tuple(supports.planes)
+        # volume, applied field and live pressure
         opening_edges, is_enclosed = self._find_openings()
-        origin = closing_point(self.planes)
+        origin = closing_point(self.planes)  # a point on all planes, or None
         volume = self._volume_form(origin, is_enclosed=is_enclosed)
         terms += self._field_and_pressure_terms()
         interaction = self._interaction_term()
         if interaction is not None:
             terms.append(interaction)
-        terms += [
-            self.factory.term(energy) for energy in self.user_and_body_energies(midsurface.edges)
-        ]
-        self.normals = {
-            name: vertex_normal(self.r0, x, midsurface.cells_of_point(name))
-            for name, x in midsurface.points.items()
-        }
-        # forces act along the normals
+        terms += [factory.term(energy) for energy in self.user_and_body_energies(midsurface.edges)]
+        # forces, which act along the normals
+        self.normals = self._normals_at_points()
         terms += self._force_terms()
+        # contacts and junctions between parts of the shell
         self.shell_contacts = self._make_shell_contacts()
         terms += self.shell_contacts
         terms += self._t_junction_terms()
+        # the system
         self._hessians = hessian_integrals(
-            self.r0, degree, terms, self.kernels, self.factory.prestress()
+            self.r0, self.degree, terms, self.kernels, factory.prestress()
         )
         edge_pressure = self._edge_pressure(opening_edges, origin) if is_enclosed else None
         self.moving = moving(self.r0, self.supports, self.loads, edge_pressure)
         constraints = supports.constraints + supports.mirror_constraints
-        self.fields = self.factory.fields
+        self.fields = factory.fields
         self.system = self._make_system(terms, constraints)
         self._mirrored_facets = self._facets_on_mirror()
         self.observe(
@@ -260,10 +290,17 @@ class ShellModel(ThinModel):
         if interaction is not None:
             interaction.refuse_near()  # reads the finished model
 
+    def _normals_at_points(self) -> dict[str, NDArray[np.float64]]:
+        """Return the undeformed normals (3,) at the named points; collective."""
+        return {
+            name: vertex_normal(self.r0, x, self.midsurface.cells_of_point(name))
+            for name, x in self.midsurface.points.items()
+        }
+
     def _refuse_normal_plies(self) -> None:
         """Refuse plies whose direction is normal to the surface of their shell; collective."""
         for shell, laminate in self.material.laminate_by_shell.items():
-            # the only shell of a model has an empty name
+            # mask of the shell's cells; the only shell of a model has an empty name
             cells = self.midsurface.patches[shell] if shell else slice(None)
             _, normals_of_cells = positions_and_normals(self.r0)
             normals = normals_of_cells[cells]
@@ -353,11 +390,12 @@ class ShellModel(ThinModel):
         """Return the natural shape, the one without stress; None if it is the undeformed one.
 
         Its amplitudes are added to `free_constants`, name -> constant. `self.loads` gets the shape
-        cell by cell in place of patch by patch. `cells` as in `_make_factory`.
+        cell by cell in place of patch by patch. `cells` is the geometry in which it is projected
+        onto polynomials.
         """
         if not self.loads.natural:
             return None
-        natural = self.loads.natural.on_cells(
+        natural = self.loads.natural.on_cells(  # a user field gives polynomials in cells
             self.midsurface.patches,
             _cell_count(self.midsurface),
             lambda user_field: user_field_polynomials(user_field, self.midsurface, cells),
@@ -380,6 +418,7 @@ class ShellModel(ThinModel):
         edges, pressed_cells = self.midsurface.edges, self.factory.pressed_sides
         # without `pressed_cells` all cells are pressed
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
+        # names of edges that move, and of those among them where a pressure has no potential
         free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
 
@@ -470,7 +509,7 @@ class ShellModel(ThinModel):
         Parameters
         ----------
         opening_edges
-            Edge name -> its facets; see `_find_openings`.
+            Edge name -> its facets with a pressed cell.
         origin
             Point (3,) over R on all symmetry planes, or None.
         """
@@ -498,7 +537,7 @@ class ShellModel(ThinModel):
         Where terms have densities, their tangents and residuals are evaluated at quadrature points
         by compiled kernels; other terms are assembled as forms.
         """
-        # cells with nodes that supports move, and the tangent's integrals on these cells alone
+        # tangent; for moving supports also cells with nodes that they move, and integrals on these
         moving_cells = None
         if self.moving:
             cells = self.moving.cells
@@ -507,6 +546,7 @@ class ShellModel(ThinModel):
             )
             moving_cells = cells, integrals
         tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
+        # residual and energies of the terms that have densities
         density_terms = [term for term in terms if isinstance(term, ShellTerm)]
         residual = self._point_residual(density_terms)
         residual.begin(energies=True)  # begins to compile its kernels
@@ -535,7 +575,7 @@ class ShellModel(ThinModel):
     ) -> FastResidual:
         """Return the residual that evaluates the densities of terms at quadrature points.
 
-        `one_by_one` keeps the residual of each term apart.
+        `one_by_one` keeps the residual of each term apart, as derivatives by a parameter need it.
         """
         return FastResidual(
             self.r0, self.u, self.degree, terms, self.kernels, one_by_one=one_by_one
@@ -580,12 +620,14 @@ class ShellModel(ThinModel):
         """Modes that break the symmetry of a half model or a sector; None for a whole shell.
 
         Modes of a half are antisymmetric displacements, with another tangent on the mirror plane
-        and other constraints there. The first access compiles kernels and is collective.
+        and other constraints there. Modes of a sector are counted on the half that its copies make.
+        The first access compiles kernels and is collective.
         """
         if self.multiplicity == 1:
             return None
         if isinstance(self.mirror, Sector):
             return SectorModes(self, self._as_half)
+        # term of the edges on the mirror plane, in place of that of symmetric displacements
         edges = self.factory.antisymmetric_edges(self._mirrored_facets, self.mirror.normal)
         # antisymmetric displacements are normal to the mirror plane on it
         constraints = self._constraints + [
@@ -624,7 +666,7 @@ class ShellModel(ThinModel):
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:
-        """Facets on the mirror planes; see `ModelBase`."""
+        """Local facets on the mirror planes of a half model or a sector; else empty."""
         return self._mirrored_facets
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
@@ -647,14 +689,19 @@ class ShellModel(ThinModel):
         return self._at_nodes(self.midsurface.chart_coordinates(self.V))
 
     def chart_by_shell(self) -> NDArray[np.float64]:
-        """Return coordinates of this rank's nodes, each in the chart of its shell; see `chart`."""
+        """Return coordinates (n, 2) of this rank's nodes, each in the chart of its own shell.
+
+        Positions (n, 3) take their place on the surface of a mesh file, which has no chart.
+        """
         return self._at_nodes(self.midsurface.chart_coordinates_by_shell(self.V))
 
     def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return one row per owned node from values (cells, nodes, components) in cells."""
+        """Return coordinates (n, d) of this rank's own nodes from those (cells, nodes, d) in cells.
+
+        A node on a seam of the chart has two positions there: it gets the smaller coordinates.
+        """
         nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
         coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
-        # a node on a seam has two positions: take the smaller coordinates
         np.minimum.at(coordinates, nodes, cells)
         return coordinates[: index_map.size_local]
 
@@ -666,6 +713,7 @@ class ShellModel(ThinModel):
         """
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
         cells_at_point = self.midsurface.cells_of_point(force.point)
+        # degrees of freedom, and the shares of a unit force on them
         if force.patch:
             dofs, values = patch_entries(
                 self.r0, x, force.patch, inward, self.degree, self.kernels, cells_at_point
@@ -682,7 +730,10 @@ def _cell_count(midsurface: Midsurface) -> int:
 
 
 def _magnetisation_by_cell(loads: Loads, midsurface: Midsurface) -> Loads:
-    """Return the loads with magnetisations given cell by cell in place of patch by patch."""
+    """Return the loads with magnetisations given cell by cell in place of patch by patch.
+
+    `loads.magnetic` is the magnetisation in an applied field, `loads.remanence` that without one.
+    """
     for name in ("magnetic", "remanence"):
         if magnetisation := getattr(loads, name):
             in_cells = magnetisation.on_cells(midsurface.patches, _cell_count(midsurface))

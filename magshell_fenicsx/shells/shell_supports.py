@@ -67,6 +67,10 @@ class ShellSupports:
         All planes, those of the modelled part first.
     by_name
         Edge, patch or point -> its support; those on planes that belong to the shell come last.
+    _r0, _V, _midsurface, _laminates, _loads, _factory
+        The parameters, and the space of the placement.
+    _clamped
+        Names of the clamped edges.
     """
 
     def __init__(
@@ -111,7 +115,7 @@ class ShellSupports:
         """Add the symmetry plane of an edge of the modelled part: energy and constraint."""
         self.planes.append(plane)
         facets = self._midsurface.edges[name]
-        # a name of the energy; the second plane of a sector needs another one
+        # name of the energy; that of the second plane of a sector must be another one
         edge = "mirror edges" if name == SYMMETRY_EDGE else f"{name} mirror edges"
         energy = self._factory.mirror_edges(facets, plane.normal, edge)
         self.mirror_term = self._factory.term(energy)
@@ -140,7 +144,8 @@ class ShellSupports:
         energy = self._factory.mirror_edges(facets, plane.normal, edge)
         self.terms.append(self._factory.term(energy))
         self.constraints.append(support_along(self._V, 1, facets, plane.normal))
-        # the constraint across the plane is above; these only name the support's unknowns
+        # The constraint across the plane has been added. These constraints are not put on the
+        # displacement: they only tell which unknowns belong to the support.
         edge_constraints = held_on(self._V, 1, facets, ALL_COMPONENTS)
         return Support.from_conditions(edge_constraints, edge, kind="plane")
 
@@ -162,6 +167,7 @@ class ShellSupports:
             components = condition.components
         else:
             components = ALL_COMPONENTS
+        # name of the edge's energy, and rotation of its normal; neither unless it is clamped
         edge, turn = "", None
         if name in self._clamped:
             # energies of several clamped edges need a name each

@@ -92,14 +92,33 @@ class SolidModel(ModelBase):
 
     Attributes
     ----------
-    system, multiplicity, normals, kernels, supports
-        See `ShellModel`.
+    system
+        The equations that solvers take.
+    multiplicity
+        Number of modelled parts that make the body: 2 for a half, else 1.
+    normals
+        n0 (3,) at the named points.
+    kernels
+        Names and compile time of the forms in use.
+    supports
+        Name of an edge -> its support.
+    V, r0, u
+        Space of the displacement; undeformed places and displacement over R.
+    factory
+        Factory of the terms.
+    fields
+        Applied fields that are known by their values.
+    observed
+        Column -> form over the modelled part, of what the user's terms observe and of the
+        polarisation that a field induces.
     degree
         Degree of the displacement: 2.
     sigma
         None: nothing is penalised.
     without_potential
         Ends at which a live pressure has no potential.
+    _conditions
+        The parameter `conditions`.
     _terms, _pattern
         All terms of the system, and the one whose form gives the sparsity pattern.
     _held
@@ -128,7 +147,7 @@ class SolidModel(ModelBase):
         mirror: Mirror = Y0_PLANE,
     ) -> None:
         """Make the terms of the body and its system; parameters are those of the class."""
-        # None where there is none
+        # magnetisations by cell; None where there is none
         magnetic, remanence = (
             field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence)
         )
@@ -147,8 +166,10 @@ class SolidModel(ModelBase):
         self.factory = factory = self._make_factory()
         # the first term is everywhere: its form gives the sparsity pattern
         self._pattern, *areal_distortion = factory.distortions()
+        # supports, and the planes of the body's own symmetry; a point on all planes, or None
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
+        # ends that move, those of them without potential, and whether lids close all
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER_FACE}
         free_ends, self.without_potential = edge_openings(
             self.r0, ends, conditions, in_middle(body, self.V)
@@ -166,8 +187,8 @@ class SolidModel(ModelBase):
         edge_pressure = self._edge_pressure(ends, origin) if is_enclosed else None
         self._moving = moving(self.r0, self.supports, self.loads, edge_pressure)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
-        # under a pressure (None) the volume that points sweep, else that between the face and the
-        # origin
+        # Under a pressure it is the volume that points sweep, for which the origin is None. Else it
+        # is the volume between the outer face and the origin.
         if self.loads.pressure or is_enclosed:
             origin = None
         elif origin is None:
@@ -310,10 +331,10 @@ class SolidModel(ModelBase):
         return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
     def _rim(self, facets: NDArray[np.int32], height: float) -> EdgeCurve:
-        """Return the curve at the end of the pressed surface, on the facets of one end.
+        """Return the curve at which the pressed surface ends, on the facets of one end.
 
-        `height` is its place in the thickness: 1 is the outer face. All cells that it passes have
-        it at the same fraction of their own thickness.
+        `height` is the place of the curve in the thickness: 1 is the outer face. All cells that the
+        curve passes have it at the same fraction of their own thickness.
         """
         cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
         cells = cells_of_facets.array[cells_of_facets.offsets[facets]]  # behind each facet
@@ -324,7 +345,7 @@ class SolidModel(ModelBase):
         return EdgeCurve.from_facets(
             self.V,
             facets[has_height],
-            # a rank may have no such cell; then any fraction will do
+            # the fraction of all; a rank may have no such cell, and then any fraction will do
             level_sides(float(fraction_of_cell[0]) if len(fraction_of_cell) else 1.0),
         )
 
@@ -396,10 +417,10 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
 
 
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
-    """Return a density on a natural shape, from a density with a keyword `growth`.
+    """Return the density of a body with a natural shape, from one of a body without.
 
-    The growth is the deformation from the undeformed to the natural shape. The natural shape's
-    parameters follow those of the density.
+    The function of `density` must take a keyword `growth`: the deformation from the undeformed to
+    the natural shape. The natural shape's parameters follow those of the density.
     """
 
     def grown(*arguments: Expr) -> Expr:

@@ -1,8 +1,8 @@
 """Element matrices of a solid's terms: the Hessians of their densities at points, contracted in
 batches.
 
-As on the shell (see `models.shell.element_hessians`), with the jets in reference coordinates: the
-tables of the shape functions are the same for all cells.
+Jets are in reference coordinates, so that the tables of the shape functions are the same for all
+cells.
 
 A jet is a field's value and its three derivatives by the reference coordinates xi, four vectors:
 the parts 0 to 3. X is the undeformed placement, u the displacement. A term's density is integrated
@@ -67,10 +67,17 @@ class BodyHessianIntegral:
     ----------
     coupling
         Batches that couple several cells; a solid has none.
+    _dofs
+        Nodes of each cell.
     _batches, _geometry
-        The batches of cells, and `_geometry` (see the function) at the points of each.
+        The batches of cells, and at the points of each the numbers of the geometry that densities
+        want: X, the inverse of dX/dxi, the area or volume ratio, at ends n and t.
+    _points
+        Storage of the fields at points that kernels read.
     _g, _u
-        Fields at points that kernels read: geometry, and jet of u.
+        Such fields: geometry, and jet of u.
+    _contraction
+        Contraction of Hessians at points with shape functions to element matrices.
     _hessians, _pairs
         Term -> kernel of its Hessian, and the pairs of jet parts that this has.
     _varying
@@ -112,6 +119,7 @@ class BodyHessianIntegral:
         self._hessians = {}
         self._pairs: dict[str, BlockPairs] = {}
         self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
+        # kernel of each term's Hessian, between those parts of the jet on which it depends
         for term in terms:
             pairs = BlockPairs(tuple(combinations_with_replacement(term.density.parts, 2)))
             # a virtual work is differentiated by its test function, at zero
@@ -121,6 +129,7 @@ class BodyHessianIntegral:
             self._hessians[term.name] = point_hessian(
                 term.name, density, by, JET_PARTS, pairs, log, at_zero=by is not self._u
             )
+        # all pairs of parts, for the sum of all terms
         pairs_of_terms = sorted(
             {pair for pairs in self._pairs.values() for pair in pairs.within_side}
         )
@@ -177,12 +186,14 @@ class BodyHessianIntegral:
         ]
 
         def vector(f: fem.Function, start: int) -> Any:
+            """Return three numbers of a point field, from `start` on, as a vector."""
             return ufl.as_vector([f[start + c] for c in range(3)])
 
         def hessian_density(W: Any) -> Any:
             """Return the function whose Hessian by v is wanted, from an energy or a work W."""
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
+        # a virtual work takes the value of the test function before the parameters
         parameters = [vector(v, 0), *at_points] if density.work else at_points
         # X, X1, X2, u, u1, u2: both jets without the derivative through the thickness
         if density.region == "outer":
@@ -194,6 +205,7 @@ class BodyHessianIntegral:
             [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
+        # arguments X, u and H; on ends n and t; then parameters
         frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.region == "end" else []
         W = function(
             vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters
@@ -217,7 +229,7 @@ def body_hessian_integrals(
     in_body = [t for t in nonlinear if t.density.region == "body"]
     on_faces = [t for t in nonlinear if t.density.region != "body"]
 
-    def counted(cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    def selected(cells: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return those of some cells that the mask selects."""
         return cells if cell_mask is None else cells[cell_mask[cells]]
 
@@ -227,16 +239,17 @@ def body_hessian_integrals(
     for degree in sorted({t.density.degree for t in in_body}):
         rule = _rule(V, *basix.make_quadrature(basix.CellType.hexahedron, degree))
         terms_of_degree = [t for t in in_body if t.density.degree == degree]
-        integrals.append(BodyHessianIntegral(X, counted(own_cells), rule, terms_of_degree, log))
-    # for a term on faces one integral for each number of a face in its cell, since the tables of
-    # shape functions differ; all ranks go through the numbers that some rank has
+        integrals.append(BodyHessianIntegral(X, selected(own_cells), rule, terms_of_degree, log))
+    # A face has a number from 0 to 5 in its cell, on which the tables of shape functions depend. So
+    # a term on faces has one integral for each number. All ranks go through the numbers that some
+    # rank has.
     for term in on_faces:
         cells_at_facets, facet_numbers = _cells_at(body, term.density.facets)
         points, weights = term.density.rule
         counts = V.mesh.comm.allreduce(np.bincount(facet_numbers, minlength=6))
         for facet in np.flatnonzero(counts):
             rule = _rule(V, _on_facet(points, facet), weights)
-            cells = counted(cells_at_facets[facet_numbers == facet])
+            cells = selected(cells_at_facets[facet_numbers == facet])
             integrals.append(BodyHessianIntegral(X, cells, rule, [term], log, facet))
     return integrals
 
@@ -279,8 +292,8 @@ def _geometry(jets: Array, region: str, facet: int | None) -> Array:
     (cells, points, 4, 3). `facet` is the number of the face in the reference cell, None for the
     body.
     """
-    flat = jets.reshape(-1, JET_PARTS, 3)
-    if region == "outer":
+    flat = jets.reshape(-1, JET_PARTS, 3)  # by points
+    if region == "outer":  # the jet alone
         return flat.reshape(-1, SIZES[region])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives
     inverse, volume_ratio = np.linalg.inv(G), np.linalg.det(G)

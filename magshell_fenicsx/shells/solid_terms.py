@@ -65,8 +65,8 @@ class SolidDensity:
     Attributes
     ----------
     function
-        The density as a function: in the body of (X, u, H, *parameters) per volume, see
-        `body_densities`; on its outer face of (X, X1, X2, u, u1, u2, *parameters) per area of the
+        The density as a function: in the body of (X, u, H, *parameters) per volume; on its outer
+        face of (X, X1, X2, u, u1, u2, *parameters) per area of the
         reference cell; on ends, the faces above edges, of (X, u, H, n, t, *parameters) per area.
     parameters
         Numbers, or fields of vectors.
@@ -127,6 +127,8 @@ class TermFactory:
         Mesh of the body with its named faces.
     u
         Displacement over R.
+    material
+        Elastic law, with shear modulus, share of areal distortion, and bulk modulus over E.
     h
         Thickness over R.
     log
@@ -161,6 +163,7 @@ class TermFactory:
         of the shear modulus.
         """
         shear, areal_share = self.material.shear, self.material.share
+        # name of the term -> density, and its share of the shear modulus
         densities_and_shares = {
             "distortion": (body_densities.distortion, 1 - areal_share),
             "areal distortion": (body_densities.areal_distortion, areal_share),
@@ -224,7 +227,8 @@ class TermFactory:
         else None.
         """
         sheet, (scale, h) = Sheet(field), self._constants(soft_magnet.scale, self.h)
-        law, n0, *parameters = self._of_sheet(sheet, soft_magnet, applied)
+        # susceptibility or magnetisation state, normals, and the numbers of the field
+        law, n0, *parameters = self._sheet_parameters(sheet, soft_magnet, applied)
         density = SolidDensity(
             sheet.energy_in_solid, (law, scale, n0, h, *parameters), VALUE + GRADIENT
         )
@@ -244,7 +248,8 @@ class TermFactory:
             return {}
         # `magnetic`, called before, added the field in space last
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
-        law, n0, *parameters = self._of_sheet(sheet, field.soft, applied)
+        # susceptibility or magnetisation state, normals, and the numbers of the field
+        law, n0, *parameters = self._sheet_parameters(sheet, field.soft, applied)
         densities = {"volume": SolidDensity(lambda X, u, H, one: one, self._constants(1.0))}
         for axis, e in zip("xyz", np.eye(3), strict=True):
             densities[axis] = SolidDensity(
@@ -252,14 +257,14 @@ class TermFactory:
             )
         return {f"induced {name}": self._over_body(density) for name, density in densities.items()}
 
-    def _of_sheet(
+    def _sheet_parameters(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
-        """Return the parameters of a soft-magnetic body's densities, in the order of `Sheet`.
+        """Return the parameters of a soft-magnetic body's densities, in the order they take them.
 
         First the susceptibility, or the magnetisation state where the material saturates. Then the
-        undeformed normals of layers, the amplitudes, and last the vectors of the field or its
-        polynomial in space.
+        undeformed normals of layers, the amplitudes of the field and the vectors that these
+        multiply. Last the polynomial of a field in space.
         """
         chi, V = soft_magnet.susceptibility, self.u.function_space
         if callable(chi):  # a function of the place
@@ -290,15 +295,25 @@ class TermFactory:
     ) -> PointField:
         """Return the magnetisation state of a saturating material at the quadrature points.
 
-        The state holds two Taylor polynomials of the energy in the field, at u and at u = 0; see
-        `saturation`. It is computed again when the places, u or the field have changed. `chi` is
-        the susceptibility.
+        The state holds two Taylor polynomials of the energy in the field, at u and at u = 0. It is
+        computed again when the places, u or the field have changed.
+
+        Parameters
+        ----------
+        chi
+            The susceptibility.
+        n0
+            Undeformed normals of layers.
+        amplitudes
+            Amplitudes of the field.
+        applied
+            The field if it is known by its values, else None.
         """
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
         table = V.element.basix_element.tabulate(1, saturation.points)[..., 0]
-        followed = (X, self.u)
+        followed = (X, self.u)  # functions with whose values the state changes
         normals = at_quadrature(n0, saturation.points)
 
         def places_and_normals() -> list[Array]:
@@ -308,10 +323,10 @@ class TermFactory:
                 np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list])
                 for f in followed
             )
+            # derivatives of X and of u by the reference coordinates, as columns
             G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (x0, u))
-            # F from du/dX, both from derivatives by reference coordinates
             F = np.eye(3) + H @ np.linalg.inv(G)
-            # along cof F n0
+            # the present normal is along cof F n0, and so along F^-T n0
             n = np.linalg.solve(np.swapaxes(F, -1, -2), normals[..., None])[..., 0]
             return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), normals]
 
@@ -324,8 +339,9 @@ class TermFactory:
         the field has its own amplitude, and a field gradient one more term.
         """
         pattern = field.remanent
+        # the module with the densities of the law
         law = body_densities if field.law == "deformation" else rotation_law
-        if callable(pattern):
+        if callable(pattern):  # a function of the place
             Br = field_in_body(pattern, self.u.function_space)
         else:
             Br = self._constants(pattern)[0]
@@ -469,18 +485,27 @@ class TermFactory:
         )
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
-        """Return Delta V/R^3 under the outer face of the modelled part.
+        """Return the form of Delta V/R^3 under the outer face of the modelled part.
 
         It is the change of the volume between the face and `origin` (3,) over R; with None, the
         volume that points sweep on straight ways from their undeformed places.
         """
-        return self._on_faces(list(self._volume_densities(1.0, origin).values()))
+        densities = self._volume_densities(1.0, origin)  # of a unit pressure
+        return self._on_faces(list(densities.values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
         """Return the term of a moment about the first tangent of an edge; collective.
 
-        `intensity` is the moment per length, in E h R; it acts on the end above the edge as a
-        traction that is linear through the thickness.
+        It acts on the end above the edge as a traction that is linear through the thickness.
+
+        Parameters
+        ----------
+        name, edge
+            Name of the term, and of the edge.
+        intensity
+            Moment per length of an amplitude of one, in E h R.
+        amplitude
+            Name of the amplitude.
         """
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
         # cosine and sine of the reference angle, zero at first
@@ -506,7 +531,7 @@ class TermFactory:
     ) -> dict[str, SolidDensity]:
         """Return densities of p times the change of volume under the outer face, by term name.
 
-        On hinged ends the volume reaches down to the middle line, see `_hinged_facets_above`.
+        On hinged ends the volume reaches down to the middle line: they have terms of their own.
 
         Parameters
         ----------
@@ -518,14 +543,14 @@ class TermFactory:
         potential
             Whether the pressure has a potential; otherwise densities also have a virtual work.
         """
-        moves_straight, faces = origin is None, self.body.faces
         # an origin of zero needs no parameter: it is the densities' default
         parameters = self._constants(
             unit, *([origin] if origin is not None and origin.any() else [])
         )
+        # densities on the outer face and on ends: of the volume from an origin, or swept
         face_density: Callable[..., Expr] = body_densities.pressure
         end_density: Callable[..., Expr] = body_densities.sealing
-        if moves_straight:
+        if origin is None:
             face_density = body_densities.swept_volume
             end_density = body_densities.swept_volume_on_end
         face_work: Callable[..., Expr] | None = None
@@ -537,27 +562,28 @@ class TermFactory:
             "pressure": SolidDensity(
                 face_density,
                 parameters,
-                ON_FACE,
-                QUADRATURE_DEGREE,
-                "outer",
-                faces[OUTER_FACE],
+                parts=ON_FACE,
+                degree=QUADRATURE_DEGREE,
+                region="outer",
+                facets=self.body.faces[OUTER_FACE],
                 work=face_work,
             )
         }
-        if self.hinged:
-            for name, facets in self._hinged_facets_above().items():
-                # all ranks have the same terms
-                if self.body.mesh.comm.allreduce(len(facets)):
-                    densities_by_name[f"pressure {name}"] = SolidDensity(
-                        end_density,
-                        parameters,
-                        VALUE + GRADIENT,
-                        QUADRATURE_DEGREE,
-                        "end",
-                        facets,
-                        upper=name == "upper",
-                        work=end_work,
-                    )
+        # hinged ends: whole cells above the middle line, and cells of which the upper half is
+        hinged_facets = self._hinged_facets_above() if self.hinged else {}
+        for name, facets in hinged_facets.items():
+            # all ranks have the same terms
+            if self.body.mesh.comm.allreduce(len(facets)):
+                densities_by_name[f"pressure {name}"] = SolidDensity(
+                    end_density,
+                    parameters,
+                    parts=VALUE + GRADIENT,
+                    degree=QUADRATURE_DEGREE,
+                    region="end",
+                    facets=facets,
+                    upper=name == "upper",
+                    work=end_work,
+                )
         return densities_by_name
 
     def _hinged_facets_above(self) -> dict[str, Facets]:
@@ -605,8 +631,8 @@ class TermFactory:
         """Return the sum of the densities' integrals on their faces, at the displacement u.
 
         With the test function `v` it is the virtual work of each density in place of its energy.
-        Densities on the outer face are per area of the reference cell, those on ends per area; see
-        `SolidDensity.function`.
+        Densities on the outer face are per area of the reference cell, and functions of (X, X1, X2,
+        u, u1, u2). Those on ends are per area, and functions of (X, u, H, n, t).
         """
         domain, u = self.body.mesh, self.u
         # J: columns are the derivatives of X by the reference coordinates
@@ -642,4 +668,5 @@ class TermFactory:
         return sum(forms[1:], forms[0])
 
     def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:
+        """Return values as constants of forms."""
         return tuple(fem.Constant(self.body.mesh, value) for value in values)

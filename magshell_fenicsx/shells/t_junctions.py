@@ -130,12 +130,25 @@ class TieTerm:
         (n,) stiffness of the tie of places.
     _turns
         Whether there is a tie of normals: a hinge has none.
+    _comm, _u
+        Ranks of the mesh, and the displacement.
     _components
         Number of unknowns at a node.
     _own
         Number of this rank's first unknown, and how many are its own.
     _placed
         (n, 12) both tangents of both shells, undeformed.
+    _points
+        Storage of the fields that kernels read, one value at each tied point.
+    _present, _moved
+        Fields of 12 numbers, whose sum is both tangents of both shells. `_moved` stays zero:
+        kernels take derivatives by it.
+    _fixed
+        Field of 5 numbers that stay. 0 and 1: direction of the edge in its cell. 2 and 3: sine and
+        cosine of the undeformed angle. 4: stiffness of the tie of normals.
+    _kernels
+        Kernels by name: "angle" gives its sine and cosine, "energy" that of the tie of normals,
+        "gradient" and "hessian" its derivatives by the 12 tangent components.
     """
 
     amplitude = None
@@ -151,9 +164,7 @@ class TieTerm:
     ) -> None:
         """Compile the kernels of the term and take the angles of the placement; collective.
 
-        `r0` is the placement, `u` the displacement that the term follows. Kernels see the 12
-        components of both tangents of both shells as `_present` + `_moved`. `_moved` is always
-        zero; derivatives are taken by it.
+        `r0` is the placement, `u` the displacement that the term follows.
         """
         V = u.function_space
         self._comm, self._u, self._components = V.mesh.comm, u, V.dofmap.bs
@@ -167,27 +178,29 @@ class TieTerm:
         self._points = PointStorage(max(len(self._unknowns), 1))
         self._present = self._points.field(TANGENT_COMPONENTS)
         self._moved = self._points.field(TANGENT_COMPONENTS)
-        # 0, 1: direction of the edge; 2, 3: sine and cosine of the placement; 4: stiffness
         self._fixed = self._points.field(5)
         self._kernels = self._compile_kernels(log)
         self._placed = self._apply(self._tangents, global_values(r0))
+        # direction of the edge and stiffness of the tie of normals
         fixed_values = self._fixed.x.array.reshape(-1, 5)[: len(self._unknowns)]
         fixed_values[:, :2] = tied_points.edge_directions
         fixed_values[:, 4] = tied_points.stiffness[:, 1]
-        # angle of the placement, at zero displacement; this kernel reads the direction alone
-        fixed_values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
+        # sine and cosine of the undeformed angle; this kernel reads the direction alone
+        zero_displacement = 0 * global_values(r0)
+        fixed_values[:, 2:4] = self._evaluate("angle", zero_displacement)
 
     def _compile_kernels(self, log: KernelLog) -> Mapping[str, PointKernel]:
         """Return the kernels of the angle, and of the energy of the tie of normals; collective.
 
-        The energy and its derivatives are those of the change of the angle since the placement.
+        The energy is quadratic in the change of the angle from the undeformed one.
         """
         fixed = self._fixed
+        undeformed_sine, undeformed_cosine, stiffness = fixed[2], fixed[3], fixed[4]
         sine_and_cosine = _angle(self._present, self._moved, fixed)
         # sine and cosine of the difference of the present and the undeformed angle
-        sine = sine_and_cosine[0] * fixed[3] - sine_and_cosine[1] * fixed[2]
-        cosine = sine_and_cosine[1] * fixed[3] + sine_and_cosine[0] * fixed[2]
-        energy = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
+        sine = sine_and_cosine[0] * undeformed_cosine - sine_and_cosine[1] * undeformed_sine
+        cosine = sine_and_cosine[1] * undeformed_cosine + sine_and_cosine[0] * undeformed_sine
+        energy = stiffness / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
         return {
             "angle": point_values("T-junction angle", sine_and_cosine, log),
@@ -242,19 +255,21 @@ class TieTerm:
 
     @property
     def pattern_key(self) -> float:
-        """Key of the pattern, see `NonlocalTerm`: it never changes."""
+        """Number that tells one pattern of coupled nodes from another; here it never changes."""
         return 0.0
 
     def _second_variation(self, gap: Array, tangents: Array) -> Array:
-        """Return the second variation (n, k, k) at the present u; collective.
+        """Return the second variation (n, k, k) of the energy at the present u; collective.
 
-        `gap` (n, 3, k) and `tangents` (n, 12, k) map k unknowns to the tie's gap and to both
-        tangents of both shells. They may be other maps than those of the displacement, as of a
-        wave.
+        Parameters
+        ----------
+        gap, tangents
+            Maps (n, 3, k) and (n, 12, k) from k unknowns to the gap u - u' and to both tangents of
+            both shells. The unknowns are those of the displacement, or coefficients of a wave.
         """
         H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
         u = global_values(self._u)
-        if self._turns and len(H):
+        if self._turns and len(H):  # the tie of normals
             hessians = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
             # the kernel gives the upper triangle of each symmetric Hessian
             i, j = np.triu_indices(TANGENT_COMPONENTS)
@@ -269,14 +284,15 @@ class TieTerm:
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
     def _evaluate(self, kernel: str, u: Array) -> Array:
-        """Return a kernel's values (n, ..) at this rank's n points; u is given at all nodes.
+        """Return the values of a kernel (n, numbers) at this rank's n points.
 
         Parameters
         ----------
         kernel
-            "angle", "energy", "gradient" or "hessian".
+            "angle" (2 numbers), "energy" (1), "gradient" (12) or "hessian" (78, its upper
+            triangle).
         u
-            (nodes, components) nodal values of all ranks.
+            (nodes, components) displacement at the nodes of all ranks.
         """
         count = len(self._unknowns)
         self._present.x.array[: count * TANGENT_COMPONENTS] = (
@@ -319,7 +335,7 @@ class SurfaceTJunction(TieTerm):
         joint, surfaces = tied_edge.joint, MidSurfaces.gather(r0)
         edge = surfaces.edge_on_shell(facets, tied_edge.is_other_shell)
         edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, tied_edge.key, joint)
-        cell_stiffness = surfaces.cells.gather_values(stiffness)
+        cell_stiffness = surfaces.cells.gather_values(stiffness)  # of all ranks' cells
         # a tie must be stiff beside the stiffer one of the two cells
         stiffer = np.maximum(cell_stiffness[edge.cell], cell_stiffness[edge.other_cell])
         ties = _tie_stiffness(joint, material, stiffer, edge.length, edge.weight)
@@ -425,8 +441,9 @@ class MidSurfaces:
         is_other_shell
             Mask of the local cells that belong to the other shell.
         """
-        # this rank's cells beside the edge, and their sides on it
-        own_cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
+        # this rank's cells beside the edge, and both ends (n, 2, 2) of their sides on it, in the
+        # reference cell
+        own_cells, ends = _cell_sides(self.V, facets, owned=len(self.cells.own_range))
         edge_cells = self.cells.own_range.start + own_cells  # global numbers
         # exact to this degree with as many Gauss points as the element's degree
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
@@ -459,7 +476,11 @@ class MidSurfaces:
         )
 
     def _clearance(self, edge_cells: Longs, other_shell: Longs) -> float:
-        """Return `EdgeOnShell.clearance` of cells beside an edge; cells have global numbers."""
+        """Return the clearance of cells beside an edge from another shell, inf without cells.
+
+        A cell has the greatest distance of its nodes from the other shell; the clearance is the
+        least of these over the cells. Both arguments are global numbers of cells.
+        """
         nodal_places = self.r0[self.cells.nodes[edge_cells]]
         _, _, distances = self.nearest_places(nodal_places.reshape(-1, 3), other_shell)
         farthest_of_cells = distances.reshape(nodal_places.shape[:2]).max(axis=1, initial=0.0)
@@ -491,6 +512,38 @@ class MidSurfaces:
         candidate_points, candidate_cells = self._candidates(x, cells)
         if not len(candidate_points):
             return nearest, Y, distances
+        # one row for each pair of a point and a cell onto which the point can be projected
+        point, cell, reference_place, distance = self._projections(
+            x, cells, candidate_points, candidate_cells
+        )
+        # by point, then nearest first; of equally near ones the cell of the least number
+        order = np.lexsort((cell, np.round(distance, 12), point))
+        # the first projection of each point in this order
+        best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
+        nearest[point[best]] = cell[best]
+        Y[point[best]] = reference_place[best]
+        distances[point[best]] = distance[best]
+        return nearest, Y, distances
+
+    def _projections(
+        self, x: Array, cells: Longs, candidate_points: Longs, candidate_cells: Longs
+    ) -> tuple[Longs, Longs, Array, Array]:
+        """Project points onto cells, for given pairs of a point and a cell.
+
+        Parameters
+        ----------
+        x, cells
+            (n, 3) points over R, and (m,) global numbers of cells.
+        candidate_points, candidate_cells
+            Of each pair, the position of the point in `x` and that of the cell in `cells`.
+
+        Returns
+        -------
+        point, cell
+            Position of the point and global number of the cell, for each projection found.
+        X, distance
+            Its reference coordinates (.., 2) in the cell, and its distance from the point over R.
+        """
         # projection needs no corners here: they are for neighbours alone
         surface = Cells(
             self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64)
@@ -503,18 +556,10 @@ class MidSurfaces:
             np.ones(len(candidate_cells), dtype=np.int64),
             candidate_points,
         )
-        # the projections found: of which candidate pair, with point, cell and distance
+        # `pair` numbers the candidate pair of each projection
         pair, projections = nearest_places(surface, self.r0, x, candidates, np.inf)
-        point, distance = projections.point, projections.distance
         cell = cells[candidate_cells[pair]]
-        # by point, then nearest first; of equally near ones the cell of the least number
-        order = np.lexsort((cell, np.round(distance, 12), point))
-        # the first projection of each point in this order
-        best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        nearest[point[best]] = cell[best]
-        Y[point[best]] = projections.X[best]
-        distances[point[best]] = distance[best]
-        return nearest, Y, distances
+        return projections.point, cell, projections.X, projections.distance
 
     def _candidates(self, x: Array, cells: Longs) -> tuple[Longs, Longs]:
         """Return pairs of points x (n, 3) and near cells, which may hold the nearest places.
@@ -532,8 +577,8 @@ class MidSurfaces:
         centres = nodal_places.mean(axis=1)
         distances_from_centre = np.linalg.norm(nodal_places - centres[:, None], axis=2)
         radii = CELL_RADIUS_FACTOR * distances_from_centre.max(axis=1)
-        # the cell whose place is nearest has its centre within its radius of that place; points
-        # farther than a radius from the surface need no place
+        # The nearest place lies within a radius of the centre of its cell. A point farther than a
+        # radius from the surface needs no place. So two radii from point to centre are enough.
         if len(cells):
             cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
         else:
@@ -561,6 +606,14 @@ class MeridianTJunction(TieTerm):
     stiffness
         (cells, 2) E h and E h^3 of each cell over those of the first shell.
 
+    Attributes
+    ----------
+    _shapes
+        Values and slopes by s of shape functions: at the edge, then at its place on the other
+        meridian.
+    _nodes
+        (1, nodes) nodes of the cells at the edge, then of those at its place.
+
     Raises
     ------
     MeshError
@@ -582,23 +635,26 @@ class MeridianTJunction(TieTerm):
         V = r0.function_space
         ends, dofs = _ends_of_cells(V), V.dofmap.list
         # cells and shape functions at the edge, then at its place on the other meridian
-        cells, self._shapes = _parallels(V, tied)
+        cells, self._shapes = _cells_and_shapes(V, tied)
         self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
-        nodal = r0.x.array.reshape(-1, 2)
-        rho = _refuse_parallels_apart(r0, tied, material.h, key, joint)
-        # length of the edge's cell, as if it were straight
+        nodal_places = r0.x.array.reshape(-1, 2)
+        rho = _checked_radius(r0, tied, material.h, key, joint)  # radius of the edge's ring
+        # length of the edge's cell, as if it were straight: its extent in s times |dr0/ds|
         edge_cell = int(cells[0][0])
         _, slopes = self._shapes[0]
         length = np.abs(ends[edge_cell, 1] - ends[edge_cell, 0]) * np.linalg.norm(
-            slopes @ nodal[dofs[edge_cell]]
+            slopes @ nodal_places[dofs[edge_cell]]
         )
         # a tie must be stiff beside the stiffest of these cells
         stiffer = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
-        circumference = 2 * np.pi * np.array([rho])
-        ties = _tie_stiffness(joint, material, stiffer, np.array([length]), circumference)
+        circumference = 2 * np.pi * np.array([rho])  # the length for which the point stands
+        ties = _tie_stiffness(
+            joint, material, factors=stiffer, length=np.array([length]), weight=circumference
+        )
+        # maps from the unknowns to the gap u - u' and to both tangents of both shells
         gap, tangents = self._maps(AROUND_E3)
         along_e_theta = np.array([[0.0, 1.0]])
-        tied_points = TiedPoints(self._numbers(2), gap, tangents, along_e_theta, ties)
+        tied_points = TiedPoints(self._unknown_numbers(2), gap, tangents, along_e_theta, ties)
         super().__init__(joint, r0, u, tied_points, log)
 
     def entries_of_waves(self, m: float) -> Entries:
@@ -615,18 +671,25 @@ class MeridianTJunction(TieTerm):
         U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
         H = sum(self._second_variation(*self._maps(part @ U_from_P)) for part in (cosine, sine))
         # half: the mean of cos² and sin² around e3
-        return _entries(self._numbers(3), np.asarray(H / 2))
+        return _entries(self._unknown_numbers(3), np.asarray(H / 2))
 
-    def _numbers(self, components: int) -> Longs:
+    def _unknown_numbers(self, components: int) -> Longs:
         """Return the numbers (1, k) of the unknowns of both cells, `components` of each node."""
         first_numbers = components * self._nodes[:, :, None]
         return np.asarray(first_numbers + np.arange(components)).reshape(1, -1)
 
     def _maps(self, components: Array) -> tuple[Array, Array]:
-        """Return `gap` and `tangents` of `TiedPoints`, from the unknowns of both cells.
+        """Return the maps (1, 3, k) and (1, 12, k) from unknowns to the gap and to the tangents.
 
-        `components` (2, 3, c) maps the c unknowns of a node to its vector and to that vector's
-        derivative around e3. The two tangents are the derivatives along the meridian and around e3.
+        The gap is u - u'. The tangents are the derivatives along the meridian and around e3, of the
+        edge and then of the other meridian. The k unknowns are those of the nodes of both cells, c
+        at each node.
+
+        Parameters
+        ----------
+        components
+            (2, 3, c) maps from the unknowns of a node to its vector, and to that vector's
+            derivative around e3.
         """
         value, derivative = components
         gap_blocks, tangent_blocks = [], []  # of the edge, then of the other meridian
@@ -641,10 +704,12 @@ def _ends_of_cells(V: fem.FunctionSpace) -> Array:
     return np.asarray(V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0])
 
 
-def _parallels(
+def _cells_and_shapes(
     V: fem.FunctionSpace, tied: tuple[float, float]
 ) -> tuple[list[Longs], list[tuple[Array, Array]]]:
     """Return the cells at both parameters of a junction, and their shape functions.
+
+    `tied` holds the parameters of the edge and of its place on the other meridian.
 
     Returns
     -------
@@ -655,28 +720,30 @@ def _parallels(
         vertex each cell counts half.
     """
     ends, shapes = _ends_of_cells(V), []
-    is_inside = [
+    # for each parameter, a mask of the cells in which or at whose end it is
+    has_parameter = [
         (ends.min(axis=1) < s + PARAMETER_TOLERANCE) & (s - PARAMETER_TOLERANCE < ends.max(axis=1))
         for s in tied
     ]
-    # at a vertex, the mean of two cells is tied
-    cells = [np.flatnonzero(cells_at) for cells_at in is_inside]
+    cells = [np.flatnonzero(mask) for mask in has_parameter]
     for s, cells_at in zip(tied, cells, strict=True):
         # s in the reference coordinates of its cells, and slopes by s
         lengths = (ends[cells_at, 1] - ends[cells_at, 0])[:, None]
         reference_places = (s - ends[cells_at, :1]) / lengths
         tables = V.element.basix_element.tabulate(1, reference_places)[..., 0]
+        # at a vertex, the mean of two cells is tied
         N, slopes = tables / len(cells_at)
         shapes.append((N.ravel(), (slopes / lengths).ravel()))
     return cells, shapes
 
 
-def _refuse_parallels_apart(
+def _checked_radius(
     r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint
 ) -> float:
-    """Check that an edge's ring is on the other meridian, and return its radius over R; collective.
+    """Return the radius over R of an edge's ring, after a check that it is on the other meridian.
 
-    `tied` holds the parameters of the edge and of its place, `h` is the thickness over R.
+    `tied` holds the parameters of the edge and of its place, `h` is the thickness over R, and `key`
+    the key of the case file that messages begin with. Collective.
 
     Raises
     ------
@@ -684,13 +751,13 @@ def _refuse_parallels_apart(
         If the edge is not on the other shell.
     """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
-    cells, shapes = _parallels(V, tied)
+    cells, shapes = _cells_and_shapes(V, tied)
     # (rho, z) at both parameters: nodal values times shape functions
-    (rho, z), other = (
+    (rho, z), other_place = (
         N @ nodal[V.dofmap.list[cells_at].ravel()]
         for (N, _), cells_at in zip(shapes, cells, strict=True)
     )
-    distances = np.array([np.hypot(*(other - [rho, z]))])
+    distances = np.array([np.hypot(*(other_place - [rho, z]))])
     _refuse_apart(V.mesh.comm, distances, np.array([[rho, 0.0, z]]), h, key, joint)
     return float(rho)
 
@@ -710,8 +777,8 @@ def refuse_misplaced_parallels(
     for i, (joint, s, joint_cells) in enumerate(
         zip(joints, meridian.tied, meridian.joints, strict=True)
     ):
-        if joint_cells is None:  # a T-junction: no cells of a shared edge
-            _refuse_parallels_apart(r0, s, h, f"joints.{i}.edges", joint)
+        if joint_cells is None:  # a T-junction: its edges share no cells
+            _checked_radius(r0, s, h, f"joints.{i}.edges", joint)  # only the check matters here
 
 
 def _entries(unknowns: Longs, H: Array) -> Entries:
@@ -726,25 +793,28 @@ def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedP
     `ties` (n, 2) are the stiffnesses of both ties.
     """
     nodes = surfaces.cells.nodes
+    # of each point: nodes of the edge's cell, then of the other cell
     nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
     # sizes by name: -1 in `reshape` fails on a rank without points
-    points, pair_nodes = len(edge.x), nodes_of_pairs.shape[1]
-    edge_nodes, unknown_count, axes = nodes.shape[1], 3 * pair_nodes, np.eye(3)
-    on_other = surfaces.shapes(edge.Y)
-    derivatives = np.zeros((points, 4, pair_nodes))
-    # derivatives along both tangents of the edge's cell, then of the other cell
-    derivatives[:, :2, :edge_nodes] = edge.on_edge[1:].transpose(1, 0, 2)
-    derivatives[:, 2:, edge_nodes:] = on_other[1:].transpose(1, 0, 2)
+    point_count, node_count = len(edge.x), nodes_of_pairs.shape[1]
+    edge_nodes, unknown_count, axes = nodes.shape[1], 3 * node_count, np.eye(3)
+    on_other = surfaces.shapes(edge.Y)  # shape functions of the other cells, and derivatives
     # u - u': the other shell's shape functions count negative
     gap_weights = np.concatenate([edge.on_edge[0], -on_other[0]], axis=1)
+    # derivatives along both tangents of the edge's cell, then of the other cell
+    derivatives = np.zeros((point_count, 4, node_count))
+    derivatives[:, :2, :edge_nodes] = edge.on_edge[1:].transpose(1, 0, 2)
+    derivatives[:, 2:, edge_nodes:] = on_other[1:].transpose(1, 0, 2)
+    # the same weights for each of the three components
     gap = np.einsum("nk,cd->nckd", gap_weights, axes)
     tangents = np.einsum("nik,cd->nickd", derivatives, axes)
+    unknowns = 3 * nodes_of_pairs[:, :, None] + np.arange(3)
     return TiedPoints(
-        (3 * nodes_of_pairs[:, :, None] + np.arange(3)).reshape(points, unknown_count),
-        gap.reshape(points, 3, unknown_count),
-        tangents.reshape(points, TANGENT_COMPONENTS, unknown_count),
-        edge.directions,
-        ties,
+        unknowns=unknowns.reshape(point_count, unknown_count),
+        gap=gap.reshape(point_count, 3, unknown_count),
+        tangents=tangents.reshape(point_count, TANGENT_COMPONENTS, unknown_count),
+        edge_directions=edge.directions,
+        stiffness=ties,
     )
 
 
@@ -762,7 +832,8 @@ def _tie_stiffness(
     weight
         (n,) length over R for which each point stands.
     """
-    # a spring has its own stiffness and a hinge has zero; that of a rigid joint follows the cell
+    # A spring has the stiffness of its joint, and a hinge has zero. That of a rigid joint is a
+    # multiple of the cell's.
     turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
         turning_stiffness = (
@@ -809,6 +880,8 @@ def _refuse_apart(
 def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
     """Return this rank's own cells on boundary facets, with the sides that lie there.
 
+    `owned` is the number of this rank's own cells, which have the first local numbers.
+
     Returns
     -------
     cells
@@ -836,6 +909,7 @@ def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem
     `tangents` and `increments` (12,) add up to both tangents of the edge's cell and of the other
     one. The first two components of `edge_direction` give the edge in the coordinates of its cell.
     """
+    # tangents of the edge's cell (a) and of the other one (b)
     a1, a2, b1, b2 = (
         ufl.as_vector([tangents[3 * i + c] + increments[3 * i + c] for c in range(3)])
         for i in range(4)
@@ -851,7 +925,10 @@ def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem
 
 
 def _tied_edges(joints: Sequence[Joint], surface: Midsurface) -> list[TiedEdge]:
-    """Return the edges of T-junctions: first from the case's joints, then from a mesh file."""
+    """Return the edges of T-junctions: first those of the case's joints, then a mesh file's.
+
+    Those of a mesh file are rigid.
+    """
     tied = [
         TiedEdge(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
         for i, (joint, joint_cells) in enumerate(zip(joints, surface.joints, strict=True))
@@ -957,13 +1034,14 @@ def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]
         If an edge is not on the other meridian.
     """
     meridian, factors, log = model.meridian, _stiffness_factors(model), model.kernels
-    tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
+    # each joint with the parameters of its edge and place, and its cells; None: a T-junction
+    joints = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
     return [
         MeridianTJunction(
-            joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log
+            joint, f"joints.{i}.edges", model.r0, model.u, tied, factors, model.material, log
         )
-        for i, (joint, s, joint_cells) in tied
-        if joint_cells is None  # a T-junction
+        for i, (joint, tied, joint_cells) in joints
+        if joint_cells is None
     ]
 
 

@@ -9,8 +9,10 @@ Forces are integrated over a step in time from u0 to u1, of length dt. A strain 
 q/tau is integrated with the mean rate of E in the step and with its change since the last step.
 Viscous stresses are given to forms as the strain whose elastic stress they are, by the law at small
 strains. Interior edges, and those that hold the normal, open by a jump of the rotation, as in C0
-interior penalty; moments do work on it. A jet is a map's value and derivatives at a point.
-u and displacements are over R, stresses over E.
+interior penalty; moments do work on it. A held edge is a boundary edge that holds the normal or
+lies on a mirror plane. A jet is a map's value and derivatives at a point; `domain.j0` is that of
+the placement, `domain.jet(u)` that of a displacement. u and displacements are over R, stresses
+over E.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -99,10 +101,17 @@ class Viscosity:
         History variables after the steps so far.
     creep_time
         `kelvin`: the longest time in which the forces let a displacement creep to its end.
+    _model, _mu, _branches
+        The parameters `model`, `mu` and `branches`.
+    _jets, _frame
+        Function that gives the jets of nodal values at the nodes of cells, and the frame in which
+        these give strains.
     _field, _places
         Field of the stress in the forms, and the numbers of its nodes in each cell.
     _prescribed
         What the forms take: the stress, and the opening of edges.
+    _forms
+        Compiled gradients by u of the works of viscous stresses, whose sum is the force.
     _elastic_terms
         Names of the elastic terms.
     _viscous_tangent
@@ -128,7 +137,10 @@ class Viscosity:
         self._frame = TangentFrame.from_jet(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
         self._prescribed = _PrescribedStress(
-            self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0)
+            field=self._field,
+            first_displacement=fem.Function(V),
+            last_displacement=fem.Function(V),
+            stiffness=fem.Constant(V.mesh, 0.0),
         )
         works = _works(model, self._prescribed)
         gradients = [
@@ -168,14 +180,15 @@ class Viscosity:
         else:
             stress = np.zeros((*self._places.shape, STRAIN_SIZE))
         if self._branches:
-            # strains of the springs at the begin and at the end of the step, linear between these
+            # strains of the springs at the begin and at the end of the step; linear in between
             first_strains, last_strains = self.memory.strains, self._evolved(u0, u1, dt)
             for branch, first, last in zip(
                 self._branches, first_strains, last_strains, strict=True
             ):
                 stress += branch.modulus * (part * last + (1 - part) * first)
-        # edges have no history: in the middle of a step, an opening has the rate 2/dt times it
-        edge_stiffness = self.stiffness(dt, 2 / dt) if dt else 0.0
+        # edges have no history: at the middle of a step, the rate of an opening since its begin is
+        # 2/dt times the opening
+        edge_stiffness = self.stiffness(dt, rate=2 / dt) if dt else 0.0
         self._force = self._forces(stress, u0, displacement, edge_stiffness)
         return self._force
 
@@ -196,11 +209,11 @@ class Viscosity:
     def stiffness(self, dt: float, rate: float) -> float:
         """Return the viscous tangent over the elastic one for a step of length `dt`.
 
-        `rate` is dv/du at the end of the step. A branch has the share of a step's strain that its
-        spring still holds at the end.
+        `rate` is dv/du at the end of the step. A branch adds its modulus times the derivative of
+        its spring's strain at the end of the step, by the change of the shell's strain in it.
         """
         return self.creep_time * rate + sum(
-            b.modulus * (_retained_share(b, dt) + self._bending_share(b, dt) / dt)
+            b.modulus * (_retained_share(b, dt) + self._rate_change_factor(b, dt) / dt)
             for b in self._branches
         )
 
@@ -220,17 +233,19 @@ class Viscosity:
         return self._force
 
     def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """Return the force at u1 due to the curvature of the strain in time, an error estimate.
+        """Return the force at u1 due to the second derivative of the strain in time.
 
-        None for the first step after `begin`, where no earlier rate is known. Collective.
+        It is an estimate of the step's error. None for the first step after `begin`, where no
+        earlier rate is known. Collective.
         """
-        rate = self.memory.rate
-        if rate is None:
+        last_rate = self.memory.rate
+        if last_rate is None:
             return None
-        change_of_rate = self._strain_change(u0, u1) / dt - rate
-        stiffness = sum(b.modulus * self._bending_share(b, dt) for b in self._branches)
+        change_of_rate = self._strain_change(u0, u1) / dt - last_rate
+        # moduli times the factors from this change to the strains of the springs
+        factor = sum(b.modulus * self._rate_change_factor(b, dt) for b in self._branches)
         # edges have no part in the estimate: they open from u1 to u1, with zero stiffness
-        return self._forces(stiffness * change_of_rate, u1, u1, 0.0)
+        return self._forces(factor * change_of_rate, u1, u1, stiffness=0.0)
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Return the forces of a stress at nodes and of edges that open from u0 to u1; collective.
@@ -239,8 +254,10 @@ class Viscosity:
         ----------
         stress
             (cells, nodes, 12), given as the strain whose elastic stress it is.
+        u0, u1
+            Displacements between which edges open; the forces are those at u1.
         stiffness
-            Factor of the elastic stiffness of edges; see `stiffness`.
+            Viscous over elastic stiffness of edges.
         """
         prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
@@ -260,26 +277,28 @@ class Viscosity:
         It integrates dq/dt = dE/dt - q/tau exactly for a strain E that is quadratic in time,
         through both ends of the step and the begin of the step before.
         """
-        strain_change, rate = self._strain_change(u0, u1), self.memory.rate
-        change_of_rate = 0.0 if rate is None else strain_change / dt - rate
+        strain_change, last_rate = self._strain_change(u0, u1), self.memory.rate
+        change_of_rate = 0.0 if last_rate is None else strain_change / dt - last_rate
         evolved = []
         for b, q in zip(self._branches, self.memory.strains, strict=True):
             decayed = np.exp(-dt / b.time) * q
             by_mean_rate = _retained_share(b, dt) * strain_change
-            by_curvature = self._bending_share(b, dt) * change_of_rate  # of E over time
-            evolved.append(np.asarray(decayed + by_mean_rate + by_curvature))
+            by_change_of_rate = self._rate_change_factor(b, dt) * change_of_rate
+            evolved.append(np.asarray(decayed + by_mean_rate + by_change_of_rate))
         return evolved
 
-    def _bending_share(self, branch: Branch, dt: float) -> float:
+    def _rate_change_factor(self, branch: Branch, dt: float) -> float:
         """Return the factor from a change in the mean strain rate to the strain of a spring.
 
-        The change is from the last step to this one, the strain is that at the end of this step.
-        The factor is a time; zero without an earlier rate.
+        The change is from the last step to this one, of length `dt`. The strain is the part of that
+        at the end of this step which it causes. The factor is a time; zero without an earlier rate.
         """
         if self.memory.rate is None:
             return 0.0
-        # the second derivative of E is the change of mean rates over the mean of both steps
-        return _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+        # d²E/dt² is the change of mean rates over the mean length of both steps; this integral
+        # weighs its effect with the decay
+        decay_integral = _weighted_decay(dt / branch.time)
+        return decay_integral * dt * 2 * dt / (dt + self.memory.dt)
 
     def _strain_change(self, u0: Vector, u1: Vector) -> Array:
         """Return the strain at u1 minus that at u0; collective.
@@ -294,30 +313,31 @@ class Viscosity:
                 self._first_strain = (u0, self._strain(u0))
         if self._last_strain[0] is not u1:
             self._last_strain = u1, self._strain(u1)
-        return self._last_strain[1] - self._first_strain[1]
+        (_, strain_before), (_, strain_after) = self._first_strain, self._last_strain
+        return strain_after - strain_before
 
     def _strain_rate(self, u: Vector, v: Vector) -> Array:
         """Return the rate of strain at u along v, by a central difference; collective."""
         speed = max_abs(self._model.system.comm, v)
         if speed == 0:
             return np.zeros((*self._places.shape, STRAIN_SIZE))
-        step = VELOCITY_STEP_IN_THICKNESSES * self._model.material.h / speed  # in time
+        # a time in which the shell moves by a small part of its thickness
+        step = VELOCITY_STEP_IN_THICKNESSES * self._model.material.h / speed
         return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
 
     def _strain(self, u: Vector) -> Array:
         """Return E and K (cells, nodes, 12) of a displacement as tensors in space.
 
-        Each of both gives its components xx, yy, zz, xy, xz, yz.
+        E is the membrane strain, K the change of curvature. Each of both gives its components xx,
+        yy, zz, xy, xz, yz.
         """
         jets = self._jets(self._model.system.with_ghosts(u, self._mu))
-        tensors = [
+        tensors = [  # 3 x 3 in space, from components along the coordinates of the surface
             self._frame.tensor(S)
             for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
         ]
-        # xx, yy, zz, xy, xz, yz
-        return np.concatenate(
-            [S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1
-        )
+        rows, columns = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # xx, yy, zz, xy, xz, yz
+        return np.concatenate([S[..., rows, columns] for S in tensors], axis=-1)
 
 
 class _AddedViscousTangent:
@@ -326,13 +346,24 @@ class _AddedViscousTangent:
     It is an `AddedTangent`, a matrix that the system adds to its own. Viscous stresses follow the
     law at small strains, while the elastic law, as of rubber, changes with the strain. So the
     viscous tangent is no multiple of the elastic one.
+
+    Attributes
+    ----------
+    _system
+        System of the model.
+    _stiffness
+        Factor of this tangent in the system's; zero outside `scaled_by`.
+    _since
+        Displacement at which the changes of strains are taken.
+    _forms, _added
+        Compiled forms of the tangent, and the matrix for their sum.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         """Compile the forms and add this tangent to those of the model's system."""
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _StrainRates(model), ufl.TestFunction(model.V)
-        # displacement about which changes are taken, and the domain's factor
+        # the factor is 2 pi on a meridian, where integrals are per radian; else 1
         self._since, factor = rates.since, model.factory.domain.revolution_factor
         self._forms = [
             model.kernels.compile(
@@ -369,22 +400,27 @@ class _AddedViscousTangent:
         return stiffer
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """Return zero, see `AddedTangent`: viscous forces have no part in what moves a support."""
+        """Return zero, as the product of this tangent with the vector v of a support's motion.
+
+        Supports do not move in a motion with viscous forces. `factors` are not used here.
+        """
         return np.zeros_like(v)
 
 
 def _retained_share(branch: Branch, dt: float) -> float:
-    """Return the part of a strain, evenly grown in a step, that the spring holds at its end.
+    """Return the part of a step's strain that a spring still holds at its end, the rest decayed.
 
-    (1 - exp(-dt/tau)) tau/dt, or 1 for dt = 0.
+    The strain grows evenly in the step. The part is (1 - exp(-dt/tau)) tau/dt, or 1 for dt = 0.
     """
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
 
 
-def _curvature_weight(z: float) -> float:
+def _weighted_decay(z: float) -> float:
     """Return the integral of exp(-z (1 - s)) (s - 1/2) over a step, s from 0 to 1.
 
-    z is the step over the relaxation time; a series takes the place of the formula at small z.
+    exp is the decay of a strain from s to the end of the step, and s - 1/2 the part of its rate
+    that a second derivative in time adds to the mean rate. z is the step over the relaxation time;
+    a series takes the place of the formula at small z.
     """
     if z < 1e-2:
         return z / 12 - z**2 / 24 + z**3 / 80
@@ -402,7 +438,7 @@ class _PrescribedStress:
     first_displacement, last_displacement
         Displacements between which edges open.
     stiffness
-        Viscous over elastic stiffness of edges; see `Viscosity.stiffness`.
+        Viscous over elastic stiffness of edges.
     """
 
     field: fem.Function
@@ -416,6 +452,7 @@ class _PrescribedStress:
         `j` is the jet of the placement. `side` is "+" or "-" on an interior edge, "" within a cell.
         """
         stress = self.field(side) if side else self.field
+        # tensors in the coordinates, from the components in space that begin at 0 and at 6
         return covariant(j, stress, 0), covariant(j, stress, 6)
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
@@ -433,8 +470,14 @@ class _PrescribedStress:
 class _StrainRates:
     """Derivatives of strains and jumps along a change of the displacement, a trial function.
 
-    They replace `_PrescribedStress` in the forms of the tangent of viscous forces. `since` is the
-    displacement at which the derivatives are taken.
+    They replace `_PrescribedStress` in the forms of the tangent of viscous forces.
+
+    Attributes
+    ----------
+    since
+        Displacement at which the derivatives are taken.
+    _change, _jet
+        The trial function, and the jet of `since`.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
@@ -442,16 +485,19 @@ class _StrainRates:
         self._jet = model.factory.domain.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """Return the changes of strain and curvature, as in `_PrescribedStress.strain`."""
+        """Return the changes of the membrane strain and of the change of curvature.
+
+        `j` is the jet of the placement. `side` is "+" or "-" on an interior edge, "" within a cell.
+        """
         E, K = _strains(j, self._jet.side(side) if side else self._jet)
         return ufl.derivative(E, self.since, self._change), ufl.derivative(
             K, self.since, self._change
         )
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """Return the change of an edge's jump, as in `_PrescribedStress.stiff_opening`.
+        """Return the change of an edge's jump, without a stiffness: that multiplies the whole form.
 
-        The tangent's stiffness multiplies the whole form instead.
+        `jump` gives the edge's jump as a function of the deformed jet.
         """
         return ufl.derivative(jump(domain.j0 + self._jet), self.since, self._change)
 
@@ -486,8 +532,9 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 
     `r0` is the jet of the placement, `m` the covector of the edge.
     """
-    if edge.plane is not None:
+    if edge.plane is not None:  # an edge on a mirror plane with this normal
         return mirrored_jump(r0, m, edge.plane)
+    # the normal is held at that of the placement, which a moving support turns
     n0 = kin.normal(r0)
     return held_jump(r0, m, n0 if edge.turn is None else ufl.dot(edge.turn, n0))
 
@@ -497,10 +544,14 @@ def _works(
 ) -> list[ufl.Form]:
     """Return the works of viscous stresses on strains, and on edges as in C0 interior penalty.
 
-    `stresses` are numbers for the forces, or the trial function's for their tangent.
-    Their gradients by u are the viscous forces. The first form holds cells and interior edges, and
-    each further one a held edge. Smooth surfaces have no jumps, so that edges need no memory: each
-    step closes the edges that it opens.
+    The first form holds cells and interior edges, and each further one a held edge. Smooth surfaces
+    have no jumps, so that edges need no memory: each step closes the edges that it opens.
+
+    Parameters
+    ----------
+    stresses
+        Given stresses: then the gradients of the works by u are the viscous forces. Or changes of
+        strain along a trial function: then these gradients are the tangent of the forces.
     """
     inner_work = _work_in_cells(model, stresses) + _work_on_interior_edges(model, stresses)
     return [inner_work, *_works_on_held_edges(model, stresses)]
@@ -560,10 +611,11 @@ def _work_on_interior_edges(
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
-    # means over both sides; `edge` is the inverse metric, the unit conormal and its square
+    # means over both sides: viscous moment, elastic moment, and penalty
     given_moment, moment, stiffness = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
-        # j and v are the jets of placement and displacement on this side
+        # j and v are the jets of placement and displacement on this side; `edge` is the inverse
+        # metric, the unit conormal, and its square, which is 1
         edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
         given_moment += law.edge_moment(*stresses.strain(j, side), *edge) / 2
         moment += law.edge_moment(*_strains(j, v), *edge) / 2
@@ -581,15 +633,20 @@ def _works_on_held_edges(
 ) -> list[ufl.Form]:
     """Return the works on edges that hold the normal or lie on mirror planes, one form each.
 
-    A work has the three parts of `_work_on_interior_edges`, with the moments of one side.
+    As on interior edges a work has three parts, here with the moments of one side: viscous moment
+    times jump of u, opening times elastic moment of u, and opening times penalty times jump. The
+    opening is the change of the jump in the step, times the viscous stiffness.
     """
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     E, K = _strains(r0, u)
+    # components of the unit conormal, and length of the edge over its length in coordinates
     nu1, nu2, stretch = kin.conormal(r0, m)
+    # `edge` is the inverse metric, the unit conormal, and its square, which is 1
     edge, law = (kin.inverse_metric(r0), (nu1, nu2), 1), _small_strain_law(model, r0)
     given_moment = law.edge_moment(*stresses.strain(r0, ""), *edge)
     moment = law.edge_moment(E, K, *edge)
+    # penalty over the width of the cells beside boundary edges
     stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
     works = []
     for held_edge in factory.held_edges:

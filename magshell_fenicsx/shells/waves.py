@@ -8,9 +8,9 @@ cosine's and of the sine's coefficients: one form on the meridian with m as a nu
 Q_m is the second variation along waves m. In go an axisymmetric state and the energies as functions
 of a jet (value and derivatives at a point); out come the matrix of Q_m, its number of negative
 pivots (unstable directions), or all waves with any. A wave has three coefficients (U + V, V, W) at
-each node of the meridian. "Entries" are the values of one triangle of a matrix, block by block, in
-the order of `_sparsity`; the constraints of the axis and the ends are put in later. Lengths are
-over R, energies over E h R².
+each node of the meridian. "Entries" are the values of one triangle of a matrix, flat, as 3 x 3
+blocks of pairs of nodes; all matrices have the same rows and columns for them (`Waves._sparsity`).
+The constraints of the axis and the ends are put in later. Lengths are over R, energies over E h R².
 """
 
 from collections.abc import Iterable, Sequence
@@ -75,20 +75,33 @@ class Waves:
     Attributes
     ----------
     V
-        Space of the waves' coefficients (U + V, V, W); see `domains.wave_jets`.
+        Space of the waves' coefficients (U + V, V, W).
     largest
         Largest m that is examined by default, from 1 on. The perfect sphere buckles in waves of
         length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
         sqrt(R/h) fit around the equator; a wider circle has more, and so has a surface of smaller
         radii of curvature.
+    _system
+        The parameter `system`.
+    _log
+        The parameter `log`.
+    _m, _phi
+        Wave number, and coefficients of a wave, as they stand in forms.
+    _nonlinear_energies, _points
+        Energies that are not linear in u, and their Hessians along waves at quadrature points.
+    _energies
+        Terms of Q_m(phi), made at the first call of `energies_along`.
     _nodes, _weights
-        The five m of the interpolation, and the weights of their matrices for each m.
+        The five m of the interpolation, and the weights (largest + 1, 5) of their matrices for each
+        m from 0 on.
     _ranges
         Ranges of m on which definiteness is tested, finer where the last states needed it.
     _held_once, _held
         Conditions of the axis and the ends for m = 1, and for all other m.
     _matrices
         Matrices that are filled again, by name.
+    _factorisation, _counting
+        Factors that `factor_at` returns, and factors for counts alone.
     """
 
     def __init__(
@@ -124,6 +137,7 @@ class Waves:
         self._ranges = [_WaveRange(2, largest, self._nodes)]
 
     def _set_system(self, system: FiniteElementSystem) -> None:
+        """Set the system whose waves these are, with empty matrices and factors."""
         self._system, self._matrices = system, dict[str, PETSc.Mat]()
         self._factorisation, self._counting = (Factorisation(self.V.mesh.comm) for _ in range(2))
 
@@ -145,7 +159,8 @@ class Waves:
         It has the constraints of wave m, and the entries of contacts and T-junctions.
         """
         (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
-        return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
+        K = self._matrix_of_entries("tangent", entries.ravel(), m)
+        return self._with_nonlocal_entries(state, K, m)
 
     def _with_nonlocal_entries(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
         """Return the matrix K of wave m with the entries of contacts and T-junctions at a state."""
@@ -157,7 +172,7 @@ class Waves:
         # of each term: rows, columns and values
         rows, columns, values = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
         is_constrained = np.zeros(K.getSize()[0], dtype=bool)
-        is_constrained[self._rows(m)] = True
+        is_constrained[self._constrained_rows(m)] = True
         return with_entries(K, (rows, columns, values), is_constrained)
 
     def energies_along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
@@ -170,10 +185,10 @@ class Waves:
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
             for e in self._nonlinear_energies:
-                # twice the derivative by v along phi, at v = 0
-                energy, v = self._of_wave(e)
-                twice = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
-                form = ufl.replace(twice, {v: ufl.zero(3)})
+                # the second derivative by v along phi, at v = 0
+                energy, v = self._energy_of_wave(e)
+                second = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
+                form = ufl.replace(second, {v: ufl.zero(3)})
                 self._energies.append(
                     FormTerm(f"{e.name} along a wave", form, self._system.u, self._log, e.amplitude)
                 )
@@ -202,13 +217,13 @@ class Waves:
         W), and so three are assembled. Only matrices that are not positive definite are factored
         for their inertia.
         """
-        values = self.sampled_tangents(state)
+        values = self.sampled_tangents(state)  # entries of the five matrices
         if not self.nonlocal_terms:
             return self.counts_from(values)
         # entries of contacts are no polynomials in m: each wave is factored with its own
         unstable = list[int]()
         for m in range(1, self.largest + 1):
-            K = self._filled("interpolated", self._weights[m] @ values, m)
+            K = self._matrix_of_entries("interpolated", self._weights[m] @ values, m)
             self._counting.factor(self._with_nonlocal_entries(state, K, m))
             unstable.append(self._counting.negative_pivots)
         return unstable
@@ -216,15 +231,19 @@ class Waves:
     def sampled_tangents(self, state: State) -> NDArray[np.float64]:
         """Return the entries (5, entries) of the matrices at m = 0, a, b, -a, -b.
 
-        Entries are in the order of `_sparsity`, without constraints.
+        These are the nodes of the interpolation in m. Constraints are not put in.
         """
         entries = self._system.at_state(state).evaluate_forms(
             lambda: self._entries(state, self._nodes[:3])
         )
+        # those of -a and -b follow from those of a and b
         return np.concatenate([entries, _mirrored(entries[1:])]).reshape(len(self._nodes), -1)
 
     def counts_from(self, values: NDArray[np.float64]) -> list[int]:
-        """Return `counts` from matrices that `sampled_tangents` gave."""
+        """Return the number of unstable directions of each wave m = 1, 2, ... `largest`.
+
+        `values` (5, entries) are matrices that `sampled_tangents` gave.
+        """
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
@@ -257,26 +276,29 @@ class Waves:
     @cached_property
     def _bands(self) -> "list[BandedMatrices]":
         """Banded matrices of m = 1, and of all other m, which have other constraints."""
-        return [BandedMatrices(*self._sparsity, self._rows(m)) for m in (1, 2)]
+        return [BandedMatrices(*self._sparsity, self._constrained_rows(m)) for m in (1, 2)]
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of the entries of `_entries`, flat.
+        """Row and column of each entry of a wave's matrix, two flat arrays.
 
         They cover one triangle of node pairs, with the full blocks of a node with itself.
         """
         # rows and columns of the 3 x 3 blocks: those of the nodes, plus the component
-        rows, columns = (
+        first_rows, first_columns = (
             3 * nodes[:, None, None] + np.zeros((3, 3), dtype=np.int64)
             for nodes in (self._points.rows, self._points.columns)
         )
-        return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
+        components = np.arange(3)
+        rows, columns = first_rows + components[:, None], first_columns + components
+        return rows.ravel(), columns.ravel()
 
     @cached_property
     def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """The full matrix in compressed rows: row starts, columns, and positions of values.
+        """The full matrix in compressed rows: row starts, columns, and for each value its entry.
 
-        A position is the number of the entry in `_sparsity`. So entries of one triangle fill both.
+        Entries are of one triangle. So a value of the other triangle has the same entry as its
+        mirror image.
         """
         rows, columns = self._sparsity
         # entries that the other triangle mirrors
@@ -299,18 +321,21 @@ class Waves:
         the range is halved, for the next states too. A range with no more waves than coefficients
         is tested wave by wave.
         """
+        # banded matrices: of the wave m = 1, and the five that other waves are interpolated from
         bands_of_one, bands_of_others = self._bands
         matrix_of_one = bands_of_one.bands([self._weights[1] @ values])
         matrices_of_others = bands_of_others.bands(values)
 
         def is_definite(weights: NDArray[np.float64]) -> bool:
+            """Return whether the sum of the five with these weights is positive definite."""
             return bands_of_others.is_positive_definite(matrices_of_others, weights)
 
         is_definite_wave = cache(lambda m: is_definite(self._weights[m]))  # ends are shared
         indefinite = set[int]()
         if not bands_of_one.is_positive_definite(matrix_of_one, np.ones(1)):
             indefinite.add(1)
-        # a new list: copies of the waves share the old one
+        # Ranges still to be tested. Those that pass make a new list: copies of these waves share
+        # the old one.
         open_ranges, self._ranges = [*self._ranges], []
         while open_ranges:
             wave_range = open_ranges.pop()
@@ -333,13 +358,13 @@ class Waves:
 
     def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
         """Return the number of negative pivots of the interpolated matrix of wave m."""
-        self._counting.factor(self._filled("interpolated", self._weights[m] @ values, m))
+        self._counting.factor(self._matrix_of_entries("interpolated", self._weights[m] @ values, m))
         return self._counting.negative_pivots
 
-    def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
-        """Return the matrix of wave m with given entries and its constraints.
+    def _matrix_of_entries(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
+        """Return the matrix of wave m from its entries, with its constraints.
 
-        The next call with the same `name` overwrites it. `entries` are in the order of `_sparsity`.
+        The next call with the same `name` overwrites it.
         """
         row_starts, columns, entry_numbers = self._rows_of_matrix
         data = entries[entry_numbers]
@@ -353,10 +378,10 @@ class Waves:
         matrix = self._matrices[name]
         matrix.setValuesCSR(row_starts, columns, data)
         matrix.assemble()
-        matrix.zeroRowsColumns(self._rows(m), 1.0)
+        matrix.zeroRowsColumns(self._constrained_rows(m), 1.0)
         return matrix
 
-    def _rows(self, m: int) -> NDArray[np.int32]:
+    def _constrained_rows(self, m: int) -> NDArray[np.int32]:
         """Return the numbers of the constrained rows of wave m."""
         return np.concatenate([bc.dof_indices()[0] for bc in self.constraints(m)])
 
@@ -371,10 +396,11 @@ class Waves:
         }
         return {m: count for m, count in pivots.items() if count}
 
-    def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
-        """Return a form whose Hessian in v, at v = 0, is that of an energy along a wave, and v.
+    def _energy_of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
+        """Return a form whose Hessian by v, at v = 0, is that of an energy along waves m; and v.
 
-        The Hessian of the energy's cosine and sine parts is integrated around e3 with pi.
+        v holds the coefficients of the wave. The form is pi times the sum of the energies of the
+        cosine's and of the sine's coefficients, since both squares have the integral pi around e3.
         """
         v, u = fem.Function(self.V), domains.revolved_jet(self._system.u)
         cosine, sine = domains.wave_jets(v, self._m)
@@ -382,8 +408,12 @@ class Waves:
 
 
 def largest_wave_number(meridian: Meridian, length: float) -> int:
-    """Return the largest m that is examined, see `Waves.largest`; `length` is h/R."""
-    # 2.2, and 5 more, is a margin over the sphere's 1.73 to 1.86
+    """Return the largest m that is examined by default; `length` is h/R.
+
+    Waves of the length in which a sphere buckles fit 1.73 to 1.86 sqrt(R/h) times around its
+    equator. A wider circle and a larger curvature, both relative to the sphere, have more.
+    """
+    # 2.2, and 5 more, is a margin over the sphere's number
     return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
@@ -412,7 +442,10 @@ class _WaveRange:
         self.inner = np.linalg.solve(np.stack(bernstein, axis=1), weights_at_places)[1:-1]
 
     def halves(self, nodes: NDArray[np.float64]) -> list["_WaveRange"]:
-        """Return both halves of the range, which share their middle wave, the geometric mean."""
+        """Return both halves of the range; the geometric mean of its ends is in both.
+
+        `nodes` are those of the interpolation in m.
+        """
         middle = round(sqrt(self.first * self.last))  # the matrices vary most at small m
         return [_WaveRange(self.first, middle, nodes), _WaveRange(middle, self.last, nodes)]
 
@@ -424,6 +457,7 @@ def _lagrange_weights(
 
     The polynomial's value at a place is the sum of the weights times the values at the nodes.
     """
+    # one column for each node: the polynomial that is one there and zero at the others
     others = [np.delete(nodes, i) for i in range(len(nodes))]
     columns = [
         np.prod((places[:, None] - other_nodes) / (node - other_nodes), axis=1)
@@ -481,7 +515,7 @@ class SymmetryBreakingWaves:
     def tangents(self) -> Waves | None:
         """Waves that give tangents to a `StabilityMonitor`; None with contacts or T-junctions.
 
-        Their entries have no sparsity pattern in common.
+        The entries of these have no sparsity pattern in common, and are no polynomials in m.
         """
         return None if self.waves.nonlocal_terms else self.waves
 
@@ -513,7 +547,8 @@ class BandedMatrices:
     _shape
         Diagonals and columns of the band.
     _held_numbers
-        The constrained rows in the order of reverse Cuthill and McKee, that of the band.
+        Numbers of the constrained rows in the band, which has the rows in the order of reverse
+        Cuthill and McKee.
     """
 
     def __init__(
@@ -560,7 +595,8 @@ class BandedMatrices:
     def is_positive_definite(self, bands: Array, weights: Array) -> bool:
         """Return whether a weighted sum of matrices is positive definite.
 
-        `bands` are those of the matrices, as `bands` gives them; the weights add up to one.
+        `bands` (matrices, band entries) are their lower bands. The weights add up to one, and so do
+        the ones on the diagonal of constrained rows.
         """
         band = (weights @ bands).reshape(self._shape, order="F")
         _, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)

@@ -16,6 +16,9 @@ Words and symbols:
 - A bound is `max_penetration`, the largest penetration that a contact is meant to have.
 - Points `low` and `high` are two successive points of a path, the earlier one first. Their states
   are those of the stage, the scene with the solver of a step; `stage.leave` gives the model's.
+- `evaluation.evaluate(f)` calls f with the model at the state of the evaluation.
+- `scene.model.region(state, amplitude)` is the region where a body touches the shell. Its
+  `penetration` over R is negative by the gap while they do not touch.
 - h and R are thickness and reference length.
 """
 
@@ -88,7 +91,11 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     name, h = step.name, scene.problem.material.h
     # the target is a pair: what it prescribes, and the value
     target = step.load.target or step.load.limit_target
-    end_of_approach = target[1] if target and target[0].quantity == "load" else inf
+    end_of_approach = inf
+    if target:
+        prescribed, value = target
+        if prescribed.quantity == "load":
+            end_of_approach = value
     region = scene.model.region(state, name)
     # it touches already, or the step has nowhere to go
     if region.penetration > GAP_TOLERANCE * h or end_of_approach <= state.mu[name]:
@@ -123,18 +130,22 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
     case gives stays, and so does one at its upper limit. Collective.
     """
     h, settings = scene.problem.material.h, dict[str, float]()
+    # bodies on the shell; a contact that was never changed has no setting in the state
     for contact in scene.problem.loads.contacts:
         stiffness = state.mu.get(contact.setting, contact.stiffness)
-        depth = scene.model.region(state, contact.amplitude).penetration
+        depth = scene.model.region(state, contact.amplitude).penetration  # over R
         if (
             depth > contact.max_penetration * h
             and not contact.has_given_stiffness
             and stiffness < MAX_STIFFENING * contact.stiffness
         ):
             settings[contact.setting] = STIFFENING * stiffness
+    # shells on each other
     for pair, depth in shell_penetrations(scene, state):  # depth over the thickness
         stiffness = state.mu.get(pair.setting, pair.stiffness)
-        if (  # between the points of contact shells may be deeper: a part of the bound
+        # depths are those at points of contact; between these shells may be deeper, so that only
+        # a part of the bound is allowed
+        if (
             depth > BOUND_AT_POINTS * pair.max_penetration
             and not pair.has_given_stiffness
             and stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
@@ -179,12 +190,14 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
     numbers
         Setting of a pair's cuts -> their number; empty: nothing is done.
     """
-    evaluation = stage.scene.model.system.at_state(stage.leave(high.state)) if numbers else None
-    for shell_contact in _with_cuts(stage.scene):
-        if evaluation and shell_contact.pair.cuts in numbers:
-            evaluation.evaluate(
-                partial(shell_contact.recall_cuts, numbers[shell_contact.pair.cuts])
-            )
+    if not numbers:
+        return
+    evaluation = stage.scene.model.system.at_state(stage.leave(high.state))
+    for shell_contact in _surface_contacts(stage.scene):
+        if shell_contact.pair.cuts in numbers:
+            number = numbers[shell_contact.pair.cuts]
+            # the contact cuts its shells at this state and gives the cuts the number
+            evaluation.evaluate(partial(shell_contact.recall_cuts, number))
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
@@ -197,21 +210,24 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     """
     scene, state = stage.scene, stage.leave(high.state)
     evaluation = scene.model.system.at_state(state)
+    # number of the finer cuts; None where the contact has no finer ones
     numbers = {
         shell_contact.pair.cuts: evaluation.evaluate(shell_contact.finer_cuts)
-        for shell_contact in _with_cuts(scene)
+        for shell_contact in _surface_contacts(scene)
     }
     closer = {name: number for name, number in numbers.items() if number is not None}
-    is_certain = not closer or all(_is_certain(stage, point, closer) for point in (high, low))
+    # the instability is certain if closer points hardly change the modes beside it
+    is_certain = not closer or all(_has_certain_mode(stage, point, closer) for point in (high, low))
     return {} if is_certain else closer
 
 
-def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
+def _has_certain_mode(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
     """Return whether closer points of contact hardly change the critical mode at a point.
 
     The critical mode has the eigenvalue of the tangent that is nearest to zero. This eigenvalue may
-    change by less than the part `CERTAIN_STIFFNESS_CHANGE`, the number of unstable directions not
-    at all. Also True if a mode is not found: then nothing says that closer points would help.
+    change by less than `CERTAIN_STIFFNESS_CHANGE` times itself. The number of unstable directions
+    may not change. Also True if a mode is not found: then nothing says that closer points would
+    help.
 
     Parameters
     ----------
@@ -239,9 +255,10 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
     quadrature becomes less exact. Collective.
     """
     evaluation = scene.model.system.at_state(state)
+    # number of cuts made at this state; None where these are not much better
     numbers = {
         shell_contact.pair.cuts: evaluation.evaluate(shell_contact.improved_cuts)
-        for shell_contact in _with_cuts(scene)
+        for shell_contact in _surface_contacts(scene)
     }
     return {name: number for name, number in numbers.items() if number is not None}
 
@@ -254,13 +271,16 @@ def with_cuts_here(scene: Scene, state: State) -> State:
     evaluation = scene.model.system.at_state(state)
     numbers = {
         shell_contact.pair.cuts: evaluation.evaluate(shell_contact.present_cuts)
-        for shell_contact in _with_cuts(scene)
+        for shell_contact in _surface_contacts(scene)
     }
     return State(state.u, {**state.mu, **numbers})
 
 
-def _with_cuts(scene: Scene) -> list[SurfaceContact]:
-    """Return the contacts between shells that have cuts: those of surfaces, not of meridians."""
+def _surface_contacts(scene: Scene) -> list[SurfaceContact]:
+    """Return the contacts between shells on surfaces, which have cuts; those of meridians do not.
+
+    They are all contacts between shells of a model on a surface.
+    """
     return [
         shell_contact
         for shell_contact in scene.model.shell_contacts
@@ -308,11 +328,11 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     PathStopped
         If it touches its mirror image behind a plane that does not act as contact.
     """
-    model, comm = stage.scene.model, stage.scene.comm
+    model = stage.scene.model
     if not model.shell_contacts:
         return
     if model.axisymmetric:
-        displacements_of_meridian = [
+        displacements_of_meridian = [  # of all nodes, (n, 2)
             model.system.with_ghosts(model_state.u, model_state.mu).reshape(-1, 2)
             for model_state in map(stage.leave, (low.state, high.state))
         ]
@@ -322,50 +342,57 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     displacements = [  # of all ranks' nodes
         gathered_displacement(stage.scene, state) for state in (stage.leave(low.state), end)
     ]
+    _refuse_touching_mirror_image(stage.scene, end, low)
+    _refuse_through(_surface_contacts(stage.scene), displacements)
+
+
+def _refuse_touching_mirror_image(scene: Scene, end: State, low: Point) -> None:
+    """Check that no node has come to a mirror plane that does not act as contact; collective.
+
+    Parameters
+    ----------
+    end
+        State of the model at the end of the way.
+    low
+        Point at the begin of the way, where a path that is refused ends.
+
+    Raises
+    ------
+    PathStopped
+        If a node has come within half the thickness of such a plane.
+    """
+    model, comm = scene.model, scene.comm
+    assert not model.axisymmetric
+    # places of this rank's own nodes
     undeformed_places = model.r0.x.array[: model.system.size].reshape(-1, 3)
-    deformed_places = undeformed_places + model.system.with_ghosts(end.u, end.mu)[
-        : model.system.size
-    ].reshape(-1, 3)
-    evaluation, shell_contacts = (
-        model.system.at_state(end),
-        [
-            shell_contact
-            for shell_contact in model.shell_contacts
-            if isinstance(shell_contact, SurfaceContact)
-        ],
-    )
+    displacements = model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
+    deformed_places = undeformed_places + displacements
+    # half the thickness at all ranks' nodes, undeformed and at the state; equal for all contacts
+    shell_contact, *_ = _surface_contacts(scene)
+    halves = model.system.at_state(end).evaluate(shell_contact.halves)
     owned = slice(*model.V.dofmap.index_map.local_range)
-    undeformed_half_thickness, half_thickness = (
-        values[owned] for values in evaluation.evaluate(shell_contacts[0].halves)
-    )
+    undeformed_half_thickness, half_thickness = (values[owned] for values in halves)
     half_thickness = np.minimum(half_thickness, undeformed_half_thickness)
-    # across these planes contact sees the other half
+    # across the mirror planes of a half model or a sector, contact sees the other part
     seen_through = [*model.mirror.planes.values()] if model.multiplicity > 1 else []
-    for plane in (
-        mirror_plane for mirror_plane in model.planes if mirror_plane not in seen_through
-    ):
-        distance_before, distance_after = (
-            plane.signed_distance(undeformed_places),
-            plane.signed_distance(deformed_places),
-        )
+    for plane in model.planes:
+        if plane in seen_through:
+            continue
+        distance_before = plane.signed_distance(undeformed_places)
+        distance_after = plane.signed_distance(deformed_places)
         # 1 or -1: on which side of the plane the shell is
         side = np.sign(comm.allreduce(float(distance_before.sum())))
         # nodes that were farther than the thickness from the plane, and now are within half of it
-        if comm.allreduce(
-            int(
-                np.sum(
-                    (side * distance_before > 2 * undeformed_half_thickness)
-                    & (side * distance_after < half_thickness)
-                )
-            )
-        ):
+        has_come_near = (side * distance_before > 2 * undeformed_half_thickness) & (
+            side * distance_after < half_thickness
+        )
+        if comm.allreduce(int(np.sum(has_come_near))):
             raise PathStopped(
                 "the shell touches its mirror image behind a plane of boundary: symmetry, which it "
                 "does not feel: model both sides",
                 low,
                 final=True,
             )
-    _refuse_through(shell_contacts, displacements)
 
 
 def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
@@ -480,29 +507,41 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
     # `high` is the farthest itself, or too near to the turn to tell the ways apart
     if turn == len(points) or distance_from_turn < RETURN_DISTANCE * h:
         return
-    # is `high` on the way to the turn, that is near the displacement there at the same approach?
-    for earlier_point, later_point in pairwise(points[: turn + 1]):
-        displacement_before = _displacement_at(name, approaches[-1], earlier_point, later_point)
-        if displacement_before is None:
-            continue
-        if (
-            max_abs(comm, high.state.u - displacement_before)
-            < RETURN_TOLERANCE * distance_from_turn
-        ):
-            message = (
-                "the body goes back the way it came: at its fold the shell snaps under a given "
-                "approach"
-            )
-            raise PathStopped(message, low, final=True)
+    tolerance = RETURN_TOLERANCE * distance_from_turn
+    if _is_on_way(stage, name, points[: turn + 1], high, tolerance):
+        message = (
+            "the body goes back the way it came: at its fold the shell snaps under a given approach"
+        )
+        raise PathStopped(message, low, final=True)
     if max_abs(comm, high.du) == 0:  # the shell does not move with the body
         depth_low, depth_high = [
             model.region(stage.leave(point.state), name).penetration for point in (low, high)
         ]
+        # they do not touch at `high`, and the gap has grown
         if depth_high < min(depth_low, 0.0):
             message = (
                 "the body has left the shell: at its fold the shell snaps under a given approach"
             )
             raise PathStopped(message, high, final=True)
+
+
+def _is_on_way(
+    stage: Stage, name: str, way: Sequence[Point], point: Point, tolerance: float
+) -> bool:
+    """Return whether a later point of a path lies on the way that it took before; collective.
+
+    It does so if the way has the displacement of the point, within the tolerance, at the same value
+    of the amplitude `name`.
+    """
+    for earlier_point, later_point in pairwise(way):
+        displacement_before = _displacement_at(
+            name, point.state.mu[name], earlier_point, later_point
+        )
+        if displacement_before is None:  # this part of the way does not have the value
+            continue
+        if max_abs(stage.scene.comm, point.state.u - displacement_before) < tolerance:
+            return True
+    return False
 
 
 def _displacement_at(
@@ -541,6 +580,7 @@ def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> 
         between shells is `IMPACT_BOUND_RATIO` times as large.
     """
     h = scene.problem.material.h
+    # depths are over h
     for contact in scene.problem.loads.contacts:
         depth = scene.model.region(state, contact.amplitude).penetration / h
         if depth > contact.max_penetration:
@@ -585,34 +625,18 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     shells
         Words for the shells that stop the motion; "" if nothing stops it.
     """
-    model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
-    if name not in scene.motions or not model.shell_contacts:
+    # without motion of supports, or without shells that may touch, nothing stops it
+    if name not in scene.motions or not scene.model.shell_contacts:
         return end, ""
-    fixed = np.zeros(model.system.size, dtype=bool)  # unknowns with a prescribed displacement
-    for bc in model.system.clamped:
-        dofs = bc.dof_indices()[0]
-        fixed[dofs[dofs < len(fixed)]] = True
-    prescribed_nodes = np.flatnonzero(
-        np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1)
-    )
+    prescribed_nodes = _prescribed_nodes(scene)
     begin = state.mu[name]
 
     def meeting_shells(part: float) -> str:
-        """Return words for shells whose held nodes overlap after a part of the way, or ""."""
+        """Return words for shells whose prescribed nodes overlap after a part of the way, or ""."""
         moved_state = state.with_(state.u, name, begin + part * (end - begin))
-        u = np.concatenate(
-            comm.allgather(
-                model.system.with_ghosts(moved_state.u, moved_state.mu)[: model.system.size]
-            )
-        ).reshape(-1, dim)
-        for shell_contact in model.shell_contacts:
-            if (
-                shell_contact.gap_at_supports(prescribed_nodes, u)
-                < -shell_contact.pair.max_penetration * scene.problem.material.h
-            ):
-                return shell_contact.pair.words
-        return ""
+        return _overlapping_shells(scene, moved_state, prescribed_nodes)
 
+    # sample the way, then halve the interval between the last free and the first overlapping sample
     parts_of_way = np.linspace(0.0, 1.0, SAMPLES_OF_MOTION)
     first_meeting = next(
         (i for i in range(1, SAMPLES_OF_MOTION) if meeting_shells(parts_of_way[i])), None
@@ -629,6 +653,32 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     return float(begin + free_part * (end - begin)), meeting_shells(overlapping_part)
 
 
+def _prescribed_nodes(scene: Scene) -> NDArray[np.int64]:
+    """Return the global numbers of nodes with all components prescribed by supports; collective."""
+    system, components = scene.model.system, 2 if scene.model.axisymmetric else 3
+    is_prescribed = np.zeros(system.size, dtype=bool)  # this rank's own unknowns
+    for bc in system.clamped:
+        dofs = bc.dof_indices()[0]
+        is_prescribed[dofs[dofs < len(is_prescribed)]] = True
+    of_all_ranks = np.concatenate(system.comm.allgather(is_prescribed))
+    return np.flatnonzero(of_all_ranks.reshape(-1, components).all(axis=1))
+
+
+def _overlapping_shells(scene: Scene, state: State, nodes: NDArray[np.int64]) -> str:
+    """Return words for the first pair of shells that overlap at some nodes; "" if none; collective.
+
+    Shells overlap if their penetration exceeds the pair's bound. `nodes` have global numbers.
+    """
+    system, components = scene.model.system, 2 if scene.model.axisymmetric else 3
+    own_displacement = system.with_ghosts(state.u, state.mu)[: system.size]
+    u = np.concatenate(system.comm.allgather(own_displacement)).reshape(-1, components)
+    for shell_contact in scene.model.shell_contacts:
+        largest_overlap = shell_contact.pair.max_penetration * scene.problem.material.h
+        if shell_contact.gap_at_supports(nodes, u) < -largest_overlap:
+            return shell_contact.pair.words
+    return ""
+
+
 def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
     """Return the contacts of the bodies that penetrate the shell at a state; collective."""
     contacts = scene.problem.loads.contacts
@@ -640,9 +690,10 @@ def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
 
 
 def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
-    """Check that no shells touch: else the second variation of a wave has no derivative here.
+    """Check that no shells touch at a state; collective.
 
-    Collective.
+    Where shells touch, the second variation of a wave has no derivative, and so a result that
+    depends on it has no gradient.
 
     Parameters
     ----------
@@ -654,8 +705,8 @@ def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
     CaseError
         With the shells that touch.
     """
-    for pair, deep in shell_penetrations(scene, state):
-        if deep > 0:
+    for pair, penetration in shell_penetrations(scene, state):
+        if penetration > 0:
             raise CaseError(
                 f"{result}: has no gradient where shells touch ({pair.words}): take symmetry: "
                 "half, where a wave is a mode as others are, or differences of runs"
@@ -674,12 +725,14 @@ def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
         return
     evaluation = scene.model.system.at_state(state)
     for shell_contact in scene.model.shell_contacts:
-        shell_contact.hold(evaluation.evaluate(shell_contact.freeze))
+        # the frozen contact has the active set of the state, and takes the place of the real one
+        frozen_contact = evaluation.evaluate(shell_contact.freeze)
+        shell_contact.hold(frozen_contact)
     try:
         yield
     finally:
         for shell_contact in scene.model.shell_contacts:
-            shell_contact.hold(None)
+            shell_contact.hold(None)  # back to the real one
 
 
 def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -> State | None:
@@ -726,8 +779,9 @@ def stiffened_equilibrium(scene: Scene, state: State) -> State:
             contact for contact in touching_bodies(scene, state) if not contact.has_given_stiffness
         ]
         stiffer_state = with_stiffer_bodies(scene, state, bodies) if bodies else None
-        if stiffer_state is None:
+        if stiffer_state is None:  # no body may become stiffer, or there is no equilibrium near
             break
+        # penetration before the change, and displacement by the change
         depth = max(scene.model.region(state, contact.amplitude).penetration for contact in bodies)
         state, displacement = stiffer_state, _largest_displacement(scene, state, stiffer_state)
         if displacement <= RIGID_RATIO * depth:

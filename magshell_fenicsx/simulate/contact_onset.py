@@ -42,7 +42,7 @@ def first_contact(
     here, prediction
         States of the step's system at both ends of the step.
     """
-    # not of meridians, where steps do without
+    # contacts of surfaces alone: steps of a meridian do without this
     contacts = [
         contact for contact in scene.model.shell_contacts if isinstance(contact, SurfaceContact)
     ]
@@ -55,9 +55,9 @@ def first_contact(
     first_event = 1.0, False
     loses_forces = False
     for contact in contacts:
-        if at_begin.evaluate(contact.penetration):
+        if at_begin.evaluate(contact.penetration):  # it touches already: does it come apart?
             loses_forces |= not at_end.evaluate(contact.penetration)
-        else:
+        else:  # it is open: where does it close?
             onset = _onset(contact, scene.problem.material.h, begin_displacement, end_displacement)
             # the earliest; of equal ones that behind a contact
             first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
@@ -91,7 +91,8 @@ def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float
     part, is_behind
         The part of the way, 1 without a contact; and whether the step ends behind the contact.
     """
-    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())  # relative to each other
+    # two nodes come nearer to each other by at most twice the largest displacement
+    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())
     depth = CONTACT_DEPTH * h
     if not largest_approach or not contact.come_near(u, v):
         return 1.0, False

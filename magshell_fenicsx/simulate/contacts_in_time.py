@@ -30,7 +30,8 @@ class _ContactPlaces:
     Attributes
     ----------
     bodies
-        For each body the state of the points on which it presses, see `BodyContact.point_state`.
+        For each body the relative displacements of the points on which it presses, and their
+        factors of the thickness.
     shells
         For each contact between shells the displacement of the shells that may touch.
     """
@@ -57,6 +58,8 @@ class ContactsInTime:
         The approaches.
     settings
         Names of the stiffnesses between shells.
+    _system, _body_contacts, _shell_contacts
+        The system; and the contacts of bodies and between shells, each as a sequence.
     _begin
         Displacement at the begin of the present step, and the arguments of contact forces there.
     """
@@ -120,10 +123,10 @@ class ContactsInTime:
             Position within the step, from 0 to 1, at which the system takes its forces.
         """
         places_before, places_after = self._at_begin(begin), self._places(end)
-        for pressing, place_before, place_after in zip(
+        for body_contact, place_before, place_after in zip(
             self._body_contacts, places_before.bodies, places_after.bodies, strict=True
         ):
-            pressing.average(place_before, place_after, part)
+            body_contact.average(place_before, place_after, part)
         for contact, displacement_before, displacement_after in zip(
             self._shell_contacts, places_before.shells, places_after.shells, strict=True
         ):
@@ -134,10 +137,10 @@ class ContactsInTime:
 
     def use_state_forces(self) -> None:
         """Let contact forces be those of the present state again."""
-        for pressing in self._body_contacts:
-            pressing.use_present_forces()
+        for body_contact in self._body_contacts:
+            body_contact.use_present_forces()
         for contact in self._shell_contacts:
-            contact.samples = ()
+            contact.samples = ()  # without samples it takes the force of the present state
 
     def penetration_message(self, begin: State, end: State) -> str:
         """Return which shells pass through each other in a step, in words; "" if none do."""
@@ -156,9 +159,11 @@ class ContactsInTime:
 
     def _at_begin(self, begin: State) -> _ContactPlaces:
         """Return the arguments of contact forces at the begin of a step, computed once."""
+        # the displacement is compared by identity of the array
         if self._begin is None or self._begin[0] is not begin.u:
             self._begin = begin.u, self._places(begin)
-        return self._begin[1]
+        _, places = self._begin
+        return places
 
     def _places(self, state: State) -> _ContactPlaces:
         """Return the arguments of contact forces at a state."""

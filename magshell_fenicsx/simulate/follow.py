@@ -104,10 +104,7 @@ def follow(
             return
         begin, state, scene = state, run.end, run.scene
         if search and step.load.search:
-            from magshell_fenicsx.simulate.search import search_at_end_of_step
-
-            for record in search_at_end_of_step(scene, step, begin, state):
-                yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
+            yield from _search_records(scene, step, begin, state)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and run.is_at_event:
             raise Stopped(
                 f"{run.place}ends at a {run.label}, from which the next step cannot start"
@@ -117,9 +114,16 @@ def follow(
 def follow_alone(
     scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
-    """Yield the records of a history that stays in one scene; see `follow`.
+    """Yield the records of a history that stays in one scene; collective.
 
     It is for callers that read results in the scene itself.
+
+    Parameters
+    ----------
+    search
+        Whether steps search for the further solutions that they request.
+    remark
+        Called with one sentence on what the result must not be read without.
 
     Raises
     ------
@@ -133,6 +137,19 @@ def follow_alone(
                 "command: leave out then and branches, or take symmetry: none"
             )
         yield record
+
+
+def _search_records(
+    scene: Scene, step: ProgrammeStep, begin: State, end: State
+) -> Iterator[Record]:
+    """Yield the records of further solutions that a step searches for at its end; collective.
+
+    `begin` and `end` are the states at both ends of the step.
+    """
+    from magshell_fenicsx.simulate.search import search_at_end_of_step
+
+    for record in search_at_end_of_step(scene, step, begin, end):
+        yield replace(record, step=step.number, scene=scene, shown=scene.displacement)
 
 
 def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
@@ -204,6 +221,8 @@ class _StepRun:
         Whether there was an instability.
     place
         Begin of a message that says which step of a list this is; empty for a single load.
+    _step, _remark
+        The parameters.
     _last, _first_instability
         The last record of the path, and the first one of an instability on it that is known to be
         the first; None so far.
@@ -262,6 +281,7 @@ class _StepRun:
             If a shell is released elsewhere than at a fold or a bifurcation of its path.
         """
         fold = self._last
+        # nothing is released, or in the larger model, which has the mode of the bifurcation
         if not (self._step.load.released_by and fold) or self._is_released_at_bifurcation:
             return ""
         if fold.label != "fold" or fold.mode:  # a mode: one that the model excludes
@@ -283,7 +303,8 @@ class _StepRun:
             return
         records: Records | None = None
         if step.load.released_by:
-            if self._is_released_at_bifurcation:  # on the path itself, branch 0
+            # the snap starts in the larger model; its first record is still on the path (branch 0)
+            if self._is_released_at_bifurcation:
                 record = symmetry_switch_of_step(self.scene, step, record).record(number=0)
                 self.scene = record.scene or self.scene
                 yield self._completed(record)
@@ -323,7 +344,8 @@ class _StepRun:
         if record.said:
             self._remark(self.place + record.said)
         self.remark_on_point_forces(scene)
-        # with kinetic energy: shells that hit each other may penetrate more for a moment
+        # shells that hit each other, in a motion with kinetic energy, may penetrate more for a
+        # moment
         is_moving = bool((record.clock or {}).get("kinetic"))
         recorded = scene.journal.recorded_values(
             lambda: RecordedValues({"said": penetration_message(scene, state, moving=is_moving)})

@@ -73,7 +73,9 @@ class LoadsInTime:
     ) -> None:
         """Make a curve for each history, collect its kinks, and check that supports do not jump."""
         self._mu, time = dict(state.mu), partial(dimensionless_time, problem)
+        # amplitude -> its history
         histories = dict(zip(load.drives, load.history.values(), strict=True))
+        # unit of time, and amplitude -> load of the programme's step that varies it
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
@@ -86,11 +88,12 @@ class LoadsInTime:
             strength = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(
                 curve(history, time_in_case_unit, level, value),  # in the case's unit of time
-                strength,
-                unit,
+                size=strength,
+                unit=unit,
                 amplitude=step.of_history if step else float,
             )
             self.marks |= set(marks(history, time, time(load.duration)))
+            # a support must begin where it is
             first_value, present_value = self._curves[name](0.0, False), state.mu[name]
             jump = abs(first_value - present_value)
             if name in motions and jump > JUMP_TOLERANCE * max(1.0, abs(present_value)):
@@ -99,6 +102,7 @@ class LoadsInTime:
                     f"{present_value:.6g}"
                 )
 
+        # times from which the step of differences follows: the duration, and those of histories
         times = [time(load.duration)]
         times += [time(t) for history in histories.values() for t in times_of(history)]
         self._difference_step = DIFFERENCE_STEP * min(t for t in times if t)

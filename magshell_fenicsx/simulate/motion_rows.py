@@ -187,10 +187,11 @@ class StepRefinement:
         """
         errors = list[float]()
         for i, (motion, _) in enumerate(self._rows(steps)):
-            coarser_u = rows[min(i, len(rows) - 1)]
+            coarser_u = rows[min(i, len(rows) - 1)]  # that run may have ended earlier
             difference = _distance(self.scene, motion.u, coarser_u)
+            # the difference is 1 - ratio² of the coarser run's error, and this run has ratio² of it
             errors.append(ratio**2 / (1 - ratio**2) * difference)
-            rows[i : i + 1] = [motion.u]
+            rows[i : i + 1] = [motion.u]  # replaces the row, or appends one
         return errors
 
     def _rows(self, steps: TimeSteps) -> Iterator[tuple[Motion, float]]:
@@ -199,11 +200,11 @@ class StepRefinement:
         rows = MotionRows(self.scene, integrator, self.held_conjugates, steps, self.marks)
         time_step, largest_kinetic = steps.first, integrator.kinetic(motion)
         for end in self.ends:
-            previous, count = motion, integrator.steps
+            previous, steps_before = motion, integrator.steps
             self.scene.progress.trying(_progress_point(motion), end - motion.t)
             motion, time_step = rows.advanced(previous, time_step, end)
             largest_kinetic = max(largest_kinetic, integrator.kinetic(motion))
-            yield motion, (motion.t - previous.t) / (integrator.steps - count)
+            yield motion, (motion.t - previous.t) / (integrator.steps - steps_before)
             if self.is_over(previous, motion, largest_kinetic):
                 return
 
@@ -222,6 +223,8 @@ class MotionRows:
 
     Parameters
     ----------
+    integrator
+        Integrator of time steps, whose counts of iterations and factors go on from row to row.
     held_conjugates
         Amplitude that is unknown -> its conjugate: the displacement on which it does work.
     steps
@@ -231,6 +234,14 @@ class MotionRows:
     refinement
         Chooses steps so that the errors of rows are within the tolerance of `steps`; None: these
         are taken as they are.
+
+    Attributes
+    ----------
+    _refined_steps
+        Steps that the refinement has chosen, with errors; None before it has.
+    _factored_point
+        Point of the journal with the state to which the latest factors belonged; None where the
+        factors are there, or the journal has not been replayed.
     """
 
     scene: Scene
@@ -240,7 +251,6 @@ class MotionRows:
     marks: Collection[float]
     refinement: StepRefinement | None = None
     _refined_steps: RefinedSteps | None = field(default=None, init=False)
-    # of the journal: what the latest factors belonged to
     _factored_point: Point | None = field(default=None, init=False)
 
     def advanced(
@@ -257,6 +267,7 @@ class MotionRows:
         is_known
             Whether the journal has the motion at that time.
         """
+        # called between time steps, where the run may stop
         check = partial(self.scene.journal.check, is_known)
         for mark in [*sorted(mark for mark in self.marks if motion.t < mark < end), end]:
             # the acceleration may jump at a mark
@@ -330,24 +341,22 @@ class MotionRows:
             raise Stopped(str(e)) from None
         iterations = integrator.iterations - iterations_before
         factorisations = integrator.factorisation.count - factorisations_before
-        state = scene.model.system.with_moved_supports(State(motion.u, motion.mu))
-        error, pivots = self._error(motion, end), self._negative_pivots(state)
-        point = Point(
-            state,
-            motion.t,
-            motion.v,
-            time_step,
-            pivots,
-            pivots,
-            iterations,
-            factorisations,
-            error=error,
-            habit=scene.newton.factorisation.habit,
-        )
+        point = self._point_of(motion, time_step, end)
+        point = replace(point, iterations=iterations, factorisations=factorisations)
         # those of the three points that the journal does not have yet
         for new_point in (point, *self._companions(motion))[len(known_points) :]:
             scene.journal.record(new_point)
         return motion, time_step, point
+
+    def _point_of(self, motion: Motion, time_step: float, end: float) -> Point:
+        """Return the motion at a row as a point, with its error and pivots; collective.
+
+        `time_step` is the step to go on with, `end` the time of the motion.
+        """
+        state = self.scene.model.system.with_moved_supports(State(motion.u, motion.mu))
+        error, pivots = self._error(motion, end), self._negative_pivots(state)
+        habit = self.scene.newton.factorisation.habit
+        return Point(state, motion.t, motion.v, time_step, pivots, pivots, error=error, habit=habit)
 
     def _known_points(self) -> list[Point]:
         """Return the points of the next row that the journal has, at most three."""
@@ -362,7 +371,11 @@ class MotionRows:
     def _replayed(
         self, point: Point, companion: Point, factored_point: Point
     ) -> tuple[Motion, float, Point]:
-        """Return motion, next time step and point of a row from its three points of the journal."""
+        """Return motion, next time step and point of a row from its three points of the journal.
+
+        They are the point of the motion, that with its acceleration and work, and that of the
+        latest factors.
+        """
         # the factors are made again only if the motion goes on from here
         self._factored_point = factored_point
         self.scene.newton.factorisation.habit = point.habit
@@ -440,10 +453,11 @@ class MotionRows:
         # beside a body factors belong to a whole step: each interval makes its own
         if self.integrator.contact:
             self.integrator.factored_state = None
-        if factored_point and factored_point.s and not self.integrator.contact:  # s: time step
+        # s is the time step of the factors, 0 if there were none
+        if factored_point and factored_point.s and not self.integrator.contact:
             state = factored_point.state
             self.integrator.factor(
                 FactoredState(state.u, dict(state.mu), factored_point.s, factored_point.habit)
             )
-        elif factored_point:
+        elif factored_point:  # the choice of the solver alone
             self.integrator.factorisation.habit = factored_point.habit

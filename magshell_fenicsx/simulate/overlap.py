@@ -45,27 +45,39 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     CaseError
         If magnetised parts intersect.
     """
-    pairs, h, factor = problem.loads.pairs, problem.material.h, problem.thickness
-    if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MAX_CELLS:
+    loads = problem.loads
+    if not (loads.pairs or loads.joints or loads.interaction) or cells > MAX_CELLS:
         return
     if problem.axisymmetric:
-        from magshell_fenicsx.parts.contact.meridian_contact import (
-            ModelMeridian,
-            meridian_contacts,
-        )
+        _refuse_overlap_on_meridian(problem)
+    else:
+        _refuse_overlap_on_surface(problem)
 
-        meridian = build_meridian(problem)
-        V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
-        r0 = meridian.placement(V)
-        refuse_misplaced_parallels(problem.loads.joints, meridian, r0, h)
-        thickness = thickness_field(factor, r0, meridian.patches) if factor else None
-        rule = meridian_domain(r0).contact_rule
-        # the zero function is the displacement; making the contacts refuses an overlap
-        model = ModelMeridian(r0, fem.Function(V), meridian.patches, h, rule, thickness)
-        meridian_contacts(pairs, model)
-        return
+
+def _refuse_overlap_on_meridian(problem: Problem) -> None:
+    """Check that shells with one axis do not overlap, and that T-junctions are on their shells."""
+    from magshell_fenicsx.parts.contact.meridian_contact import (
+        ModelMeridian,
+        meridian_contacts,
+    )
+
+    pairs, h, factor = problem.loads.pairs, problem.material.h, problem.thickness
+    meridian = build_meridian(problem)
+    V = fem.functionspace(meridian.mesh, ("Lagrange", problem.mesh.degree, (2,)))
+    r0 = meridian.placement(V)
+    refuse_misplaced_parallels(problem.loads.joints, meridian, r0, h)
+    thickness = thickness_field(factor, r0, meridian.patches) if factor else None
+    rule = meridian_domain(r0).contact_rule
+    # the zero function is the displacement; making the contacts refuses an overlap
+    model = ModelMeridian(r0, fem.Function(V), meridian.patches, h, rule, thickness)
+    meridian_contacts(pairs, model)
+
+
+def _refuse_overlap_on_surface(problem: Problem) -> None:
+    """Check that shells do not overlap, T-junctions are on their shells, magnets are apart."""
     from magshell_fenicsx.parts.contact.model_surface import ModelSurface, surface_contacts
 
+    pairs, h, factor = problem.loads.pairs, problem.material.h, problem.thickness
     surface = build_midsurface(problem, MPI.COMM_SELF)
     V = fem.functionspace(surface.mesh, ("Lagrange", problem.mesh.degree, (3,)))
     r0 = surface.placement(V)
@@ -77,7 +89,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         factor = replace(factor, polynomials=polynomials)
     thickness = thickness_field(factor, r0, surface.patches) if factor else None
     rule = surface_domain(r0).contact_rule
-    # as on a meridian
+    # the zero function is the displacement; making the contacts refuses an overlap
     surface_contacts(pairs, ModelSurface(r0, fem.Function(V), surface.patches, h, rule, thickness))
 
 

@@ -17,6 +17,9 @@ Words and symbols:
   Cuts divide cells of shells that touch, for quadrature of their contact.
 - A stage is the scene with the solver of one step; `leave` converts its states to the model's.
 - A generator of records returns the state at its end.
+- `path.recorded_values(f)` returns the values that f finds, and keeps them in the run's journal. A
+  resumed run takes them from there and does not call f.
+- `unlocated` of the monitor says where a mode became unstable at a place that is not known.
 """
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -80,6 +83,8 @@ class RecordStream:
     ----------
     end
         State of the model after the last record; without unknowns before the iteration ends.
+    _records
+        The parameter `records`.
     """
 
     def __init__(self, records: Records) -> None:
@@ -142,8 +147,9 @@ def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) 
     """
     # a run of a given number of points may go back on its way
     checks = _Checks(stage, path, returns=goal.until != "points")
-    checks.walk = walk = ContinuationRun(path, start, goal, checks, checks.too_deep)
-    return walk
+    # the run calls the checks after each step, and the checks read the points of the run
+    checks.walk = ContinuationRun(path, start, goal, checks, checks.too_deep)
+    return checks.walk
 
 
 class _Checks:
@@ -160,6 +166,8 @@ class _Checks:
     ----------
     walk
         The run that is checked.
+    _stage, _path, _returns
+        The parameters; the path is that of the run.
     _step_begin
         s of the first point of the present step. A step leads from one point to the next, and may
         be solved several times, each time with changed settings.
@@ -192,7 +200,7 @@ class _Checks:
         """
         if low.s != self._step_begin:  # a new step; otherwise the same one is solved again
             self._step_begin, self._pivots_at_begin = low.s, low.negative_pivots
-        # from the journal in a resumed run
+        # the keys are those of `_finding`: why the step is refused, or which settings change
         findings = self._path.recorded_values(partial(self._finding, low, high)).values
         if "too_long" in findings:
             raise StepTooLong(findings["too_long"])
@@ -203,6 +211,7 @@ class _Checks:
         changed = findings["stiffer"]
         if not changed:  # penalties come first: a new depth may need other cuts
             self._last_cut_step, changed = low.s, findings["cuts"]
+            # a resumed run has the numbers of the cuts alone: it makes the cuts again
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
@@ -216,14 +225,15 @@ class _Checks:
         if not (scene.model.contacts or scene.model.shell_contacts):
             return ""
 
-        def recorded_message() -> RecordedValues:
+        def message_of_point() -> RecordedValues:
+            """Return the message under the key "said"."""
             state = self._stage.leave(point.state)
             message = penetration_message(scene, state)
             # if a penalty can become stiffer, the run shall stop before and solve again with it
             may_rise = bool(message) and bool(raised_stiffnesses(scene, state))
             return RecordedValues({"said": message if may_rise else ""})
 
-        return str(self._path.recorded_values(recorded_message).values["said"])
+        return str(self._path.recorded_values(message_of_point).values["said"])
 
     def _finding(self, low: Point, high: Point) -> RecordedValues:
         """Return why the second of two points is refused, or which settings of contact change.
@@ -252,9 +262,9 @@ class _Checks:
         has_instability = (
             high.has_instability_since(low) or low.negative_pivots != self._pivots_at_begin
         )
-        closer = (
-            closer_points(stage, low, high) if has_instability and not (stiffer or cuts) else {}
-        )
+        # cuts with closer points of contact, where these would change the instability
+        needs_closer_points = has_instability and not (stiffer or cuts)
+        closer = closer_points(stage, low, high) if needs_closer_points else {}
         return RecordedValues({"stiffer": stiffer, "cuts": cuts or closer})
 
 
@@ -274,6 +284,10 @@ class _StageRecords:
 
     Attributes
     ----------
+    _stage, _first_run, _branches
+        The parameters.
+    _goal, _monitor
+        Where the path ends, and the monitor of excluded modes.
     _branch_switch
         The first bifurcation with its branch; None so far.
     _fold_text
@@ -322,9 +336,10 @@ class _StageRecords:
             goal_precedes_stop = yield from self._records_of_run(run, path)
             if goal_precedes_stop:
                 break
+            # if the run has stopped: a fold that explains it, or the run that goes on
             if self._stop_reason:
                 records_ahead, next_run = _after_stop(
-                    stage, run, shortest_step, final=self._is_final
+                    stage, run, finest=shortest_step, final=self._is_final
                 )
             if next_run:
                 is_by_arc = next_run.path.control == "arc"
@@ -362,7 +377,7 @@ class _StageRecords:
                     yield excluded[0]
                     break
                 yield from excluded
-                self._limit(path, excluded)
+                self._limit_amplitude(path, excluded)
                 yield self._record(run, path, label, point)
                 if abs(point.state.mu[path.name]) > self._furthest:
                     break
@@ -377,10 +392,10 @@ class _StageRecords:
             self._stop_reason = ""  # the goal lies before the stop
             return True
         yield from excluded
-        self._limit(path, excluded)
+        self._limit_amplitude(path, excluded)
         return False
 
-    def _limit(self, path: Path, excluded: Sequence[Record]) -> None:
+    def _limit_amplitude(self, path: Path, excluded: Sequence[Record]) -> None:
         """Let a path with `until: limit` end soon after its first excluded instability.
 
         Its amplitude may reach `MAX_RATIO_TO_EXCLUDED` times that of the instability.
@@ -397,6 +412,7 @@ class _StageRecords:
     def _record(self, run: ContinuationRun, path: Path, label: Label, point: Point) -> Record:
         """Return the record of a point; the branch of the first bifurcation is kept for later."""
         stage, mode = self._stage, ""
+        # "step" in place of the label, if the instability is local to a point force
         label = _label_of(stage, path, label, point, ends=run.done)
         if label == "bifurcation":
             by_arc = _arc_length_path(stage, path)
@@ -522,19 +538,20 @@ def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | Non
         StepOptions(first_length, LONGEST * first_length, 1e-6 * first_length),
         metric.scale,
     )
-    # of this product the sign alone counts: whether the amplitude first grows or falls
+    # The run starts in the direction of the last step. Of the product of d mu/ds and the change of
+    # s the sign alone counts: whether the amplitude first grows or falls.
     change_of_s = last_point.s - points[-2].s if step_lengths else goal.sense
     start = by_arc.start(last_point.state, last_point.dmu * change_of_s)
     return checked_run(stage, by_arc, start, goal)
 
 
 def _branches(
-    stage: Stage, path: Path, crossing: BranchSwitch, goal: ContinuationGoal, steps: int
+    stage: Stage, path: Path, branch_switch: BranchSwitch, goal: ContinuationGoal, steps: int
 ) -> Iterator[Record]:
     """Yield the records of both directions of a branch.
 
     Each ends at the target of the path, or after `steps` steps. The second direction is followed
-    also if the first one is lost.
+    also if the first one is lost. `branch_switch` has the first points of both.
 
     Raises
     ------
@@ -542,7 +559,7 @@ def _branches(
         After both, with the reasons, if a direction is lost.
     """
     stop_reasons = []
-    for number, start in enumerate(crossing.starts, 1):
+    for number, start in enumerate(branch_switch.starts, 1):
         try:
             yield from follow_branch(
                 stage, _arc_length_path(stage, path), start, off_path(goal, steps), number
@@ -570,7 +587,7 @@ def follow_branch(
     start
         First point of the branch; it is corrected again until its contacts are fit.
     number
-        Number of the branch, see `Record.branch`.
+        Number of the branch; the two directions at a bifurcation have 1 and 2.
 
     Returns
     -------
@@ -582,20 +599,9 @@ def follow_branch(
     Stopped
         If the branch is lost.
     """
-    try:
-        for _ in range(MAX_CONTACT_CHANGES):
-            if not (own_contact := with_own_contact(stage.scene, stage.leave(start.state))):
-                break
-            start = path.recorrected(
-                start, State(start.state.u, {**start.state.mu, **own_contact.mu})
-            )
-    except PathStopped as e:
-        raise Stopped(f"no first point of the branch with contact of its own: {e}") from None
-    walk, monitor, stop_reason = (
-        checked_run(stage, path, start, goal),
-        stage.scene.stability_monitor,
-        "",
-    )
+    start = _with_fit_contact(stage, path, start)
+    walk, monitor = checked_run(stage, path, start, goal), stage.scene.stability_monitor
+    stop_reason = ""
     monitor.begin(path, start, stage.leave, evaluate=True)
     yield Record("step", path.name, start, branch=number, excluded_pivots=monitor.unstable)
     try:
@@ -620,6 +626,29 @@ def follow_branch(
     if stop_reason:
         raise Stopped(stop_reason)
     return walk.points[-1].state
+
+
+def _with_fit_contact(stage: Stage, path: Path, start: Point) -> Point:
+    """Return the first point of a branch, corrected again with contact that fits it; collective.
+
+    Penalties become stiffer, and shells are cut anew, until both fit the displacement of the point.
+
+    Raises
+    ------
+    Stopped
+        If there is no such point.
+    """
+    try:
+        for _ in range(MAX_CONTACT_CHANGES):
+            # the model's state with changed settings; None if they are fit
+            state_to_solve = with_own_contact(stage.scene, stage.leave(start.state))
+            if not state_to_solve:
+                break
+            settings = {**start.state.mu, **state_to_solve.mu}
+            start = path.recorrected(start, State(start.state.u, settings))
+    except PathStopped as e:
+        raise Stopped(f"no first point of the branch with contact of its own: {e}") from None
+    return start
 
 
 def _arc_length_path(stage: Stage, path: Path) -> Path:
@@ -668,7 +697,7 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
                         label, name, point, excluded_pivots=stage.scene.stability_monitor.unstable
                     ),
                 ]
-    except PathStopped:  # as without a fold
+    except PathStopped:  # then no fold is known, as if there were none
         pass
     return []
 
@@ -676,7 +705,7 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
 def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: bool) -> Label:
     """Return the label of a point; an instability local to a point force is labelled as a step.
 
-    Such an instability depends on the mesh. It is noted for a remark (`PointForceModes`).
+    Such an instability depends on the mesh. It is noted, and the history gives a remark on it.
 
     Parameters
     ----------
@@ -706,8 +735,8 @@ def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: boo
 def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Yield records of the points where excluded modes become unstable or stable.
 
-    Crossings of modes that are local to a point force depend on the mesh: they are noted for a
-    remark (`PointForceModes`) and left out.
+    Crossings of modes that are local to a point force depend on the mesh. They are left out and
+    noted, and the history gives a remark on them.
     """
     for crossing in crossings:
         force_point = point_of_crossing(stage, path, crossing)
@@ -730,6 +759,7 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     It stands at the first point of each such cluster of a run; at other points it is "". Where the
     number of unstable directions changes by less than two over the cluster, one is a fold.
     """
+    # a cluster has a first and a last point
     other_end = next(
         (high_point for low_point, high_point in walk.clusters if low_point is point), None
     )

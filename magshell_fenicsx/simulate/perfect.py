@@ -122,6 +122,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
     mode moves.
     """
     model, mirror = scene.model, None
+    # nodes with their displacements, and for each shell a mask of its nodes
     if model.axisymmetric:
         places, inward_displacements = _along_meridian(model, mode)
         order = np.argsort(model.V.tabulate_dof_coordinates()[:, 0])
@@ -184,7 +185,7 @@ def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Arr
     in_plane = coefficients  # U and W at azimuth 0
     if mode.label:
         in_plane = np.column_stack([coefficients[:, 0] - coefficients[:, 1], coefficients[:, 2]])
-    normal = nodal_normals(model.r0)[order_of_model][:, [0, 2]]
+    normal = nodal_normals(model.r0)[order_of_model][:, [0, 2]]  # along e_rho and e_z
     rho, z = model.r0.x.array.reshape(-1, 2)[order_of_model].T
     return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", in_plane, normal)
 
@@ -200,7 +201,7 @@ def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array
     r0, displacements = (
         x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector))
     )
-    _, r_1, r_2 = np.matmul(table[:, None], r0)
+    _, r_1, r_2 = np.matmul(table[:, None], r0)  # derivatives of the places, whose product is n
     gathered = comm.allgather(
         (numbers, *(vectors.reshape(-1, 3) for vectors in (r0, displacements, np.cross(r_1, r_2))))
     )

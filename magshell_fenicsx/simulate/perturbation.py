@@ -62,7 +62,7 @@ def number_at_key(context: Context, key: str) -> float:
         If there is no number, or one that changes the mesh, a target or the modes of the perfect
         shell.
     """
-    number, _ = _value_and_kind(context, key)
+    number, _ = _value_and_length(context, key)
     if isinstance(number, bool) or not isinstance(number, int | float):
         raise CaseError(f"{key}: is no number that the case gives: {number!r}")
     if isinstance(number, int):
@@ -73,7 +73,8 @@ def number_at_key(context: Context, key: str) -> float:
         )
     if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
-    # shells.NAME.KEY: one of several shells has a KEY of its own
+    # numbers of the mesh, the shape and the output; shells.NAME.KEY is the KEY of one of several
+    # shells
     own_key = key.split(".", 2)[2] if key.startswith("shells.") else key
     section_key, _, key_in_section = own_key.partition(".")
     differentiable_keys = (*MATERIAL_KEYS, *DEVIATION_KEYS)
@@ -83,6 +84,7 @@ def number_at_key(context: Context, key: str) -> float:
             f"{key}: a number of the mesh, of the shape, of a target or of the output has no "
             "gradient here"
         )
+    # modes of the perfect shell as imperfections, of the case or of one of its shells
     imperfections = [*(context.sections.get("imperfections") or {}).values()]
     for section in (context.sections.get("shells") or {}).values():
         imperfections += section.shell.imperfections
@@ -101,10 +103,11 @@ def scale_at_key(context: Context, key: str) -> float:
     It is the absolute value of the number. For a zero it is the largest number of the list that has
     the zero; or else the reference length in the case's unit for a length, and one for others.
     """
-    value, is_length_key = _value_and_kind(context, key)
+    value, is_length_key = _value_and_length(context, key)
     if magnitude := float(abs(value)):
         return magnitude
-    parent_value, _ = _value_and_kind(context, key.rpartition(".")[0])
+    # a zero: the other numbers of its list
+    parent_value, _ = _value_and_length(context, key.rpartition(".")[0])
     if isinstance(parent_value, list):
         magnitudes = [
             abs(neighbour) for neighbour in parent_value if isinstance(neighbour, float | int)
@@ -114,13 +117,18 @@ def scale_at_key(context: Context, key: str) -> float:
     return context.shell.reference if is_length_key else 1.0
 
 
-def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
+def _value_and_length(context: Context, key: str) -> tuple[Any, bool]:
     """Return the value at a key, and whether its section declares it as a length.
 
     Parameters
     ----------
     key
         Names and indices, joined by dots.
+
+    Returns
+    -------
+    value, is_length_key
+        A number, text, list, dictionary or section; and whether it is a length.
 
     Raises
     ------
@@ -266,8 +274,8 @@ def state_with_new_loads(
     CaseError
         If the field of the first scene is zero and that of the second is not.
     """
+    # loads with targets: amplitude -> factor
     ratios = target_ratios(old, new, "load", steps)
-    field_names = [name for name in state.mu if name.startswith("lambda_")]
     # penalties of contact with bodies
     for contact, new_contact in zip(
         old.problem.loads.contacts, new.problem.loads.contacts, strict=True
@@ -280,6 +288,8 @@ def state_with_new_loads(
         for name, value in old_values.items()
         if value and name in new_values
     }
+    # amplitudes of the magnetic field
+    field_names = [name for name in state.mu if name.startswith("lambda_")]
     if "lambda_m" in state.mu and new.problem.lambda_m != old.problem.lambda_m:
         if not old.problem.lambda_m:
             raise CaseError(
@@ -316,8 +326,9 @@ def target_ratios(
         old_target, new_target = step.load.target, new_step.load.target
         if not (old_target and new_target) or old_target[0].quantity != quantity:
             continue
-        if old_target[1] and old_target[1] != new_target[1]:
-            ratios[step.name] = new_target[1] / old_target[1]
+        (_, old_value), (_, new_value) = old_target, new_target
+        if old_value and old_value != new_value:
+            ratios[step.name] = new_value / old_value
     return ratios
 
 
@@ -338,7 +349,10 @@ def same_chart_bounds(shape: object, other: object) -> bool:
 
 
 def chart_bounds(shape: object) -> tuple[Array, Array] | None:
-    """Return the bounds of the chart of a shape, lower and upper (2,); None if unknown."""
+    """Return the bounds of the chart of a shape, lower and upper (2,); None if unknown.
+
+    A disc has zeros and its radius in their place.
+    """
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
     box: tuple[Array, Array] | None = getattr(shape, "box", None)

@@ -1,7 +1,7 @@
 """Instabilities within a thickness of a point force, which are not reported.
 
 Their modes are local to the point (within a thickness), where shell theory does not hold, and they
-depend on the mesh; see `shells.near_points`. Excluded modes are those that break a symmetry of the
+depend on the mesh. Excluded modes are those that break a symmetry of the
 model; a family of them shares a tangent; at a crossing one of them becomes neutral. A stage is the
 scene with the solver of one step.
 """
@@ -27,6 +27,7 @@ def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
     family = next(family for family in modes.families if family.label == crossing.label)
 
     def mode() -> Vector:
+        """Return the mode that is neutral at the crossing."""
         _, vector = nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))
         return vector
 
@@ -49,6 +50,7 @@ def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> 
     """
 
     def mode() -> Vector:
+        """Return the mode as a displacement of the model."""
         if label == "fold":
             return stage.displacement(point.du)
         _, null_vector = nearest_to_zero(stage.newton.factor_at(point.state))
@@ -77,6 +79,7 @@ def _recorded_point(
         return ""
 
     def name_of_point() -> RecordedValues:
+        """Return the name of the point under the key "point"."""
         try:
             return RecordedValues({"point": point_of_mode(model, places, mode(), waves)})
         except NoEigenpair:

@@ -192,8 +192,8 @@ class PrescribedQuantity:
 
         A place is mu times the size of its unit, which may depend on p. So at a fixed place mu
         changes at the negative rate of this size. A gradient by p already lets the load change with
-        the targets of the case (`_load_factor`); the difference of the two rates is returned. It is
-        0 where the displacement is prescribed, as no other value is allowed there.
+        the targets of the case; the difference of the two rates is returned. Where the displacement
+        is prescribed it must be zero, and 0 is returned.
 
         Parameters
         ----------
@@ -211,7 +211,7 @@ class PrescribedQuantity:
         low_problem, high_problem = (
             problem.with_values({key: value + sign * step}) for sign in (-1, 1)
         )
-        # the size of the unit, and the load by which gradients scale states, at both values
+        # the size of the unit at both values, and the factor by which gradients scale the load
         low_size, high_size = [
             sizes_in_units(problem_nearby).size(self.dimensionless_column)
             for problem_nearby in (low_problem, high_problem)
@@ -245,11 +245,13 @@ class PrescribedQuantity:
         problem = self.scene.problem
         if self.name.startswith("lambda_") and problem.lambda_m:
             return other.lambda_m / problem.lambda_m
+        # a target is a pair of what it prescribes and its value
         old_target, new_target = self.step.load.target, other.programme[-1].load.target
-        prescribed = "conjugate" if self.by_conjugate else "load"
-        if not (old_target and new_target and old_target[0].quantity == prescribed):
+        quantity = "conjugate" if self.by_conjugate else "load"
+        if not (old_target and new_target and old_target[0].quantity == quantity):
             return 1.0
-        return new_target[1] / old_target[1] if old_target[1] else 1.0
+        (_, old_value), (_, new_value) = old_target, new_target
+        return new_value / old_value if old_value else 1.0
 
 
 class ResultSampler:
@@ -324,7 +326,8 @@ class ResultSampler:
         change
             Whether values are changes since the step began.
         """
-        at_begin = float(self._observed[0][1][column]) if change else 0.0
+        _, first_row = self._observed[0]
+        at_begin = float(first_row[column]) if change else 0.0
         return [(place, float(row[column]) - at_begin) for place, row in self._observed]
 
     @cached_property
@@ -355,7 +358,7 @@ class ResultSampler:
         try:
             if result in FOLDS:
                 begins = self._history.begins
-                _, lowest = instabilities(scene, self._records, result, begins=begins)[0]
+                (_, lowest), *_ = instabilities(scene, self._records, result, begins=begins)
                 return lowest
             refuse_moving(scene, self._records[-1], result)
             _, adjoint_of_end = adjoint_at_end(scene, self._history, result)
@@ -365,7 +368,7 @@ class ResultSampler:
 
     def adjoint_at(self, record: Record, column: str) -> Adjoint:
         """Return the adjoint of a column at a record of the last step."""
-        return adjoint(self.scene, record, column, None, self._history.begins)
+        return adjoint(self.scene, record, column, hold=None, begins=self._history.begins)
 
     def slopes(self, adjoints: Sequence[Adjoint], key: str, has_place: Sequence[bool]) -> Array:
         """Return derivatives (n,) of results by a number of the case.
@@ -386,10 +389,11 @@ class ResultSampler:
                 for result_adjoint in adjoints
             ]
         )
+        # `rate` is (dmu/dp)/mu of the load that keeps the place, beyond what gradients count
         if not any(has_place) or not (rate := self.prescribed.load_rate(key)):
             return slopes
         name = self.prescribed.name
-        # dy/dmu times dmu/dp of the load that keeps the place; `rate` is (dmu/dp)/mu
+        # dy/dmu times dmu/dp
         slopes_by_place = [
             float(derivative(result_adjoint, name))  # type: ignore[arg-type]
             * result_adjoint.state.mu[name]
@@ -423,9 +427,16 @@ class ResultSampler:
         return self._record_at_place[place]
 
     def _record_at(self, place: float) -> Record:
-        """Return the record of the equilibrium at a place, see `record_at`.
+        """Solve the equilibrium at a place, and return its record; collective.
 
         It is solved between the first two points of the path that have the place between them.
+
+        Raises
+        ------
+        PlaceOutsidePath
+            If no points of the path have it between them.
+        UnreadPlace
+            If Newton's method fails there.
         """
         path, prescribed = self._path(), self.prescribed
         values = [prescribed.place_of(record.point.state) for record in path]
@@ -445,8 +456,10 @@ class ResultSampler:
                 f"{prescribed.column} = {place:.6g} is outside the path, which {extent}{stop_text}",
                 place,
             )
+        # place and state at both sides
         low, high = ((values[i], path[i].point.state) for i in (segment, segment + 1))
-        stage = stage_of_step(self.scene, prescribed.step, low[1])
+        _, low_state = low
+        stage = stage_of_step(self.scene, prescribed.step, low_state)
         try:
             state = self._state_between(stage, low, high, place)
         except LostResult as e:
@@ -503,16 +516,16 @@ class ResultSampler:
             raise LostResult(
                 "the iteration has left the path" if outcome.converged else outcome.reason
             )
-        # a state half way to the nearer end replaces this end
+        # The equilibrium half way to the nearer end is solved first. It replaces this end.
         half_way_place = (place + (low_place if part < 0.5 else high_place)) / 2
         middle = half_way_place, self._state_between(stage, low, high, half_way_place, halvings - 1)
         new_low, new_high = (middle, high) if part < 0.5 else (low, middle)
         return self._state_between(stage, new_low, new_high, place, halvings - 1)
 
     @staticmethod
-    def _is_between(low: float, high: float, place: float, slack: float) -> bool:
+    def _is_between(low: float, high: float, place: float, tolerance: float) -> bool:
         """Return whether a place is between two places, up to a tolerance."""
-        return min(low, high) - slack <= place <= max(low, high) + slack
+        return min(low, high) - tolerance <= place <= max(low, high) + tolerance
 
 
 def read(
@@ -534,7 +547,7 @@ def read(
     slopes
         Whether to differentiate; else slopes are zero.
     fields
-        Field by which results are differentiated as well (see `gradients.gradient`) -> how many
+        Field by which results are differentiated as well, as "remanence" or "thickness" -> how many
         numbers this field has, and a function from a gradient to the derivatives by these numbers.
         They follow the derivatives by `keys`.
 
@@ -546,12 +559,13 @@ def read(
         If a result has no derivative.
     """
     sampler, fields = ResultSampler(scene, requests), fields or {}
-    # results whose value at the begin of the step is read too, as further rows
+    # rows of the requests, then of results whose value at the begin of the step is needed too
     changing = list(dict.fromkeys(request.of for request in requests if request.change))
     adjoints = [sampler.adjoint(request) for request in requests]
     adjoints += [sampler.adjoint_at(sampler.begin, result) for result in changing]
     has_place = [request.at is not None for request in requests] + [True for _ in changing]
     values = np.array([result_adjoint.value_in_unit for result_adjoint in adjoints])
+    # one column for each key, then for each number of each field
     count_of_numbers = len(keys) + sum(count for count, _ in fields.values())
     derivatives = np.zeros((len(adjoints), count_of_numbers))
     for i, key in enumerate(keys if slopes else ()):
@@ -574,5 +588,5 @@ def read(
         for request in requests
         if request.at is not None
     }
-    count = len(requests)
-    return Readings(values[:count], derivatives[:count], curves)
+    n = len(requests)  # without the rows at the begin of the step
+    return Readings(values[:n], derivatives[:n], curves)

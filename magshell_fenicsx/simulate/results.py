@@ -94,12 +94,14 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
         that have one.
     """
     model, system = scene.model, scene.model.system
+    # a target shape
     if callable(result):
         return _misfit(scene, state, result)
-    zero_by_u: Vector = np.zeros(system.size)
+    # the energy, whose derivative is the residual
     if result == "energy":
         by_u = model.multiplicity * system.residual(state.u, state.mu)
         return Functional(scene.observe(state)["energy"], by_u, energy=model.multiplicity)
+    # the displacement of a point
     points = _displacements(scene)
     if result in points:
         point, axis = points[result]
@@ -107,23 +109,18 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
         by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[axis]
         return Functional(scene.observe(state)[result], system.zero_at_supports(by_u))
     if result in (conjugate_columns := conjugates(scene)):
-        # J = -dPi/dmu over its unit, which may depend on the size of the shell: the forms
+        # J = -dPi/dmu over its unit. The unit may depend on the size of the shell; then `forms` are
+        # the derivatives by it.
         name, conjugate_unit = conjugate_columns[result]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / conjugate_unit)
         value = -system.potential(state.u, state.mu, name) / conjugate_unit
         forms = [(term, -value / model.load_size[name]) for term in model.size_terms(name)]
         return Functional(value, by_u, potentials={name: -1 / conjugate_unit}, forms=forms)
     if result in AT_POLE and "pole" in model.normals:
-        # w = -u . n0 at the pole
-        by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
-        by_normal = {"pole": -1 / scene.problem.material.h}
-        return Functional(
-            scene.observe(state)["w_pole_over_h"],
-            system.zero_at_supports(by_u),
-            deflections=by_normal,
-        )
-    if result in (forces := _forces(scene)):
-        support, axis = forces[result]
+        return _deflection_of_pole(scene, state)
+    # the reaction of a support
+    if result in (reactions := _reactions(scene)):
+        support, axis = reactions[result]
         return _reaction(scene, state, support, axis, result)
     # a column of a part, as of a sensor
     for part_observables in OBSERVABLES:
@@ -132,9 +129,20 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
     # an amplitude, by its name or its column
     name = next((name for name in state.mu if result in (name, amplitude(name).column)), "")
     if name:
-        return Functional(state.mu[name], zero_by_u, {name: 1.0})
+        return Functional(state.mu[name], np.zeros(system.size), {name: 1.0})
     raise CaseError(
         f"{result}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}"
+    )
+
+
+def _deflection_of_pole(scene: Scene, state: State) -> Functional:
+    """Return the deflection w = -u . n0 at the pole, over h, as a functional; collective."""
+    model, h = scene.model, scene.problem.material.h
+    by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / h)
+    return Functional(
+        scene.observe(state)["w_pole_over_h"],
+        model.system.zero_at_supports(by_u),
+        deflections={"pole": -1 / h},
     )
 
 
@@ -154,7 +162,7 @@ def differentiable(scene: Scene, state: State) -> list[str]:
             "energy",
             *conjugates(scene),
             *_displacements(scene),
-            *_forces(scene),
+            *_reactions(scene),
             *at_pole,
             *part_columns,
             *amplitudes,
@@ -188,7 +196,7 @@ def force_unit(scene: Scene) -> float:
     return scene.problem.modulus * scene.problem.material.h * scene.problem.length**2
 
 
-def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
+def _reactions(scene: Scene) -> dict[str, tuple[str, int]]:
     """Return column of a reaction -> the support and the axis (0, 1 or 2)."""
     supports = scene.problem.supports if scene.problem.reactions else ()
     return {f"{name}_f{axis}": (name, i) for name in supports for i, axis in enumerate("xyz")}
@@ -215,6 +223,7 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, result: str) -> 
             f"{result}: has no gradient under a pressure at a free edge, which has no potential"
         )
     axis_direction = rotation(problem.azimuth)[:, axis]
+    # the unit motion e of the support, times the unit of forces: the reaction is e . R
     reaction_vector = force_unit(scene) * weights(scene.model, name, axis_direction, problem.mirror)
     value = dot(system.comm, reaction_vector, system.forces(state.u, state.mu))
     return Functional(
@@ -285,11 +294,15 @@ def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]
 
 
 def _misfit(scene: Scene, state: State, target: Target) -> Functional:
-    """Return the mean square distance to a target over the area, in R^2, as a functional."""
+    """Return the mean square distance to a target over the area, in R^2, as a functional.
+
+    Collective.
+    """
     model, system = scene.model, scene.model.system
     over_area, offset_to_target = model.over_area(), offset(scene, target)
     gap, log = system.u - offset_to_target, model.kernels
     one = fem.Constant(model.V.mesh, 1.0)
+    # the result is the quotient of these two integrals
     square = FormTerm("misfit", over_area(ufl.dot(gap, gap)), system.u, log)
     area_form = FormTerm("area", over_area(one), system.u, log)
     evaluation = system.at_state(state)

@@ -145,7 +145,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     """
     from magshell_fenicsx.shells.solid import SolidModel
 
-    def factor(x: Array) -> Array:
+    def thickness_factor(x: Array) -> Array:
         """Return thickness over h (n,) at undeformed places (n, 3)."""
         thicknesses = (problem.thickness or Thickness()).values_at(x)
         refuse_unfit(thicknesses, x, comm)
@@ -158,7 +158,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
         problem.material.h,
         solid.layer_bounds,
         comm,
-        factor,
+        thickness_factor,
     )
     return SolidModel(
         body,
@@ -224,9 +224,27 @@ class Scene:
             self.model = build_solid_model(self.problem, comm)
         else:
             self.model = build_model(self.problem, comm)
+        self._examine_supports()
+        self.newton = BorderedNewton(self.model.system, self._newton_options())
+        self.journal: SolverJournal = NoJournal()
+        self.progress: Progress = NoProgress()
+        self.remesh: Callable[[Problem], Problem] = lambda problem: problem
+        self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
+
+    def _examine_supports(self) -> None:
+        """Check that supports hold the shell, or that it may move; collective.
+
+        Sets `allows_rigid_motion` and `free_in_time`, and adds a warning for a shell that moves
+        freely.
+
+        Raises
+        ------
+        MeshError
+            If supports leave a rigid motion free and something needs it held.
+        """
         surface = self.model.midsurface
-        # a clamped support holds a shell for sure. But a mesh file may have several pieces, each of
-        # which must be held; and a meridian is always examined
+        # A clamped support holds a shell for sure. But a mesh file may have several pieces, each of
+        # which must be held. And a meridian is always examined.
         is_from_file = surface is not None and surface.from_mesh_file
         may_be_loose = self.model.axisymmetric or is_from_file
         is_held_for_sure = self.problem.fixed and not may_be_loose
@@ -243,20 +261,18 @@ class Scene:
         self.free_in_time = bool(free_motion)
         if free_motion:
             self.warnings.append(NOT_COUNTED)
+
+    def _newton_options(self) -> NewtonOptions | None:
+        """Return the options of the solver of a model with contact; None (the default) without."""
         pairs = [contact.pair for contact in self.model.shell_contacts]
         stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
-        options = None
-        if self.model.contacts or stiffnesses:
-            # a penetration changes over far less than h. So factors of a near-by state are of no
-            # use, and the first iterations only find out what touches: patience
-            options = NewtonOptions(
-                reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
-            )
-        self.newton = BorderedNewton(self.model.system, options)
-        self.journal: SolverJournal = NoJournal()
-        self.progress: Progress = NoProgress()
-        self.remesh: Callable[[Problem], Problem] = lambda problem: problem
-        self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
+        if not (self.model.contacts or stiffnesses):
+            return None
+        # A penetration changes over far less than h. So factors of a near-by state are of no use.
+        # The first iterations only find out what touches, and the solver must have patience.
+        return NewtonOptions(
+            reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
+        )
 
     def with_field_strength(self, context: Context) -> "Scene":
         """Return the scene of a case that differs by the strength of the field alone.
@@ -401,10 +417,12 @@ class Scene:
         """
         self.refuse_foreign(state, allows_more=True)
         model, surface = self.model, self.model.midsurface
+        # all nodal values at the state, with those of moving supports
         displacement = fem.Function(model.u.function_space, name="u")
         displacement.x.array[:] = model.system.at_state(state).evaluate(
             lambda: model.u.x.array.copy()
         )
+        # the mesh that a program has given, if it has
         mesh_file = self.problem.mesh_file
         user_mesh = mesh_file.user_mesh if mesh_file else None
         if not (surface and mesh_file and user_mesh):
@@ -440,7 +458,8 @@ class Scene:
                 f"this scene has {unloaded.u.size}; take records of follow or trace of the same "
                 "scene"
             )
-        # entries of the history, as angles of edges, come with the first steps of a path
+        # `system.history` has entries that a state keeps, as angles of edges; they come with the
+        # first steps of a path
         further_amplitudes = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
         missing_amplitudes = unloaded.mu.keys() - state.mu.keys()
         if missing_amplitudes or (further_amplitudes and not allows_more):
@@ -462,6 +481,7 @@ class Scene:
         model, h, loads = self.model, self.problem.material.h, self.model.loads
         force = loads.forces.get("force")
         energies = self.energies(state)  # by group of terms
+        # deflections over h: of the pole, and that on which the load does work
         pole = model.deflection(state.u, "pole") / h
         deflection = pole
         if loads.displaced:  # the name of the load whose displacement w is reported
@@ -498,7 +518,7 @@ class Scene:
         """
         model, columns = self.model, dict[str, float]()
         for term in self.problem.loads.user_terms:
-            # without a density nothing has this amplitude
+            # a term without a density has no energy, and so no amplitude
             factor = state.mu[term.name] if term.density else 1.0
             for column in term.observed:
                 integral = model.system.at_state(state).integral(model.observed[column])
@@ -529,7 +549,7 @@ class Scene:
 
     @property
     def sources(self) -> dict[str, str]:
-        """Amplitude of a moving source -> its column, see `source_columns`."""
+        """Amplitude of a moving source of the field -> its column in path.csv."""
         return source_columns(self.problem.loads)
 
     @cached_property
@@ -633,4 +653,5 @@ def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
     for error in outcomes:
         if isinstance(error, CaseError):
             raise error
+    # the first warning of any rank
     return next((warning for warning in outcomes if warning), None)

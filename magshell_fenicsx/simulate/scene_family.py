@@ -13,7 +13,9 @@ Words and symbols:
 - A wave has m crests around a meridian; the meridian's own axisymmetric model excludes it, so it
   has a tangent of its own. m = 0 stands for a mode of the model itself.
 - A stage is the scene with the solver of the step in which the instability is. `enter` and `leave`
-  convert states of the model to states of the stage's system and back.
+  convert states of the model to states of the stage's system and back. A stage has a device if it
+  holds conjugates of amplitudes, and is parametrised if it varies several amplitudes together.
+- `transfer(a, b, u)` gives a displacement of scene a in the unknowns of scene b.
 - The chart has the coordinates of the undeformed surface. A knot of a meridian is a value of its
   parameter at which cells must end, as at a rim.
 - The programme is the list of the case's steps.
@@ -112,7 +114,7 @@ def refuse_excluded_mode(mode: str) -> None:
     Parameters
     ----------
     mode
-        Name of the mode, see `Record.mode`: "m = 7" and "antisymmetric" are modes that a reduced
+        Name of the mode: "m = 7" and "antisymmetric" are modes that a reduced
         model excludes.
 
     Raises
@@ -185,6 +187,10 @@ class SceneFamily:
     _origin
         The scene whose mesh and amplitudes all others have: that of the case, or one at another p
         that has more amplitudes.
+    _make_problem, _range
+        The parameters `make_problem` and `value_range`.
+    _record_value
+        Value of p in the record: the parameter `value`.
     _record
         Row at the instability, in the unknowns of the origin.
     _base, _first
@@ -264,10 +270,11 @@ class SceneFamily:
         low, high = self._range
         step = TEST_DISTANCE * (high - low)
         candidates = [p for p in (value + step, value - step) if low <= p <= high]
+        # names of amplitudes, of the first scene and of those at the candidates
         names = self._origin.unloaded().mu.keys()
         scenes = {p: self._scene(p) for p in candidates}
         names_at = {p: scene.unloaded().mu.keys() for p, scene in scenes.items()}
-        # the scene with the most amplitudes
+        # the candidate whose scene has the most amplitudes
         test_value = max(candidates, key=lambda p: len(names_at[p]))
         new_names = names_at[test_value] - names
         has_all_and_more = names_at[test_value] > names
@@ -297,16 +304,19 @@ class SceneFamily:
             If the loads of earlier steps, or held conjugates, would change along the boundary.
         """
         record, programme = self._record, scene.problem.programme
+        # waves around a meridian are excluded modes that can be followed
         if not (self.m and scene.model.axisymmetric):
             refuse_excluded_mode(record.mode)
         earlier_steps, step = programme[: record.step - 1], programme[record.step - 1]
-        # conjugates are held at values of the state before the step, which p would change
+        # A step may hold conjugates (displacements on which loads do work) at values of the state
+        # before it. After earlier steps p would change these values.
         if earlier_steps and any(law != "load" for law in step.load.hold.values()):
             raise CaseError(
                 f"{step.key}.hold: a boundary needs what is held to be held from the start: give "
                 "one step"
             )
         for earlier in earlier_steps:
+            # a target is a pair of what it prescribes and its value
             target = earlier.load.target or earlier.load.limit_target
             if earlier.load.hold or (target and target[0].quantity == "conjugate"):
                 raise CaseError(
@@ -519,6 +529,7 @@ class SceneFamily:
         stage = self._stages.pop(p, None)  # put back at the end: the least used is the first
         if stage is None:
             scene = self._scene(p)
+            # a system with further unknowns or parameters, as that of the base; or the model's own
             if self._base.device or self._base.parametrised:
                 stage = self._base.on_scene(scene)
             else:
@@ -537,8 +548,10 @@ class SceneFamily:
             If the model's symmetry or the mesh differs in kind, or there is no mesh.
         """
         old, new = self._origin.problem, self.problem(p)
-        symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, new)]
-        if symmetries[0] != symmetries[1]:
+        old_symmetry, new_symmetry = (
+            (problem.axisymmetric, problem.mirror, problem.azimuth) for problem in (old, new)
+        )
+        if old_symmetry != new_symmetry:
             raise NoSystem(
                 "the symmetry of the model changes on the way: give the case symmetry: none"
             )
@@ -629,8 +642,10 @@ class SceneFamily:
         if shared_forms is None:
             return
         stages, comm = self._stages, self._origin.model.system.comm
+        # forces of the scenes with forms of their own, and how much they change with p
         forces_at = {p: self._forces(stage, p) for p, stage in stages.items()}
         change = max(max_abs(comm, forces - forces_at[value]) for forces in forces_at.values())
+        # the same with shared forms: `_stage` now makes stages that have these
         self._shared_forms, self._stages = shared_forms, {}
         differences = [
             max_abs(comm, self._forces(self._stage(p), p) - forces)
@@ -639,6 +654,7 @@ class SceneFamily:
         if max(differences) <= SHARED_FORMS_TOLERANCE * change:
             self._base = self._stage(value)
             return
+        # back to scenes with forms of their own
         shared_forms.leave()
         self._shared_forms, self._stages = None, stages
 

@@ -75,8 +75,10 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
     # models with contacts or dead loads are always built anew
     if not model.thin or model.contacts or model.shell_contacts or old.loads.dead:
         return False
-    symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, problem)]
-    if symmetries[0] != symmetries[1] or _fields(problem) != _fields(old):
+    old_symmetry, new_symmetry = (
+        (each.axisymmetric, each.mirror, each.azimuth) for each in (old, problem)
+    )
+    if old_symmetry != new_symmetry or _kinds_of_fields(problem) != _kinds_of_fields(old):
         return False
     if _has_fields_by_patch(problem) or _has_fields_by_patch(old):
         return False
@@ -99,7 +101,7 @@ def _data_without_fields(problem: Problem) -> dict[str, Any]:
     }
 
 
-def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
+def _kinds_of_fields(problem: Problem) -> tuple[bool | str | float, ...]:
     """Return which fields the terms of a problem have, to be compared with another problem.
 
     They are flags of remanence and thickness, the scale of a soft material (0.0 without one), and
@@ -125,6 +127,7 @@ def _has_fields_by_patch(problem: Problem) -> bool:
 def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:
     """Put the fields of a problem into the coefficients of a model; collective."""
     magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
+    # name -> coefficient of the terms' forms
     coefficients = {
         coefficient.name: coefficient
         for term in model.system.terms

@@ -56,12 +56,13 @@ def dented_states(scene: Scene, state: State) -> Iterator[State]:
     There are none of flat shells. Of several shells each is dented alone, then all are.
     """
     system = scene.model.system
+    # deformed places of this rank's nodes
     places = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
     h = scene.problem.material.h
     shells = [CurvedShell.of_nodes(scene, places, is_own) for is_own in nodes_of_shells(scene)]
     curved_shells = [shell for shell in shells if shell.top > MIN_HEIGHT * h]
     for depth in DEPTHS:
-        dents = [shell.dent(depth, h) for shell in curved_shells]
+        dents = [shell.dent(depth, h) for shell in curved_shells]  # displacements
         all_at_once = [np.sum(dents, axis=0)] if len(dents) > 1 else []
         for dent in [*dents, *all_at_once]:
             yield State(state.u + system.zero_at_supports(dent.ravel()), dict(state.mu))
@@ -123,9 +124,9 @@ class CurvedShell:
         width = FOLD_WIDTH * np.sqrt(2 * h * depth * self.top)
         # a fold at the supports could not bend; shallow shells have it half way up
         lowest_plane = min(SUPPORT_DISTANCE * width, self.top / 2)
-        height_above = self.height - max((1 - depth) * self.top, lowest_plane)
-        # a mirrored point moves by twice its height above the plane. Instead of max(0, height) the
-        # smooth function width log(1 + exp(height/width)) is taken, so that the fold is rounded
+        height_above = self.height - max((1 - depth) * self.top, lowest_plane)  # above the plane
+        # A mirrored point moves by twice its height above the plane. Instead of max(0, height) the
+        # smooth function width log(1 + exp(height/width)) is taken, so that the fold is rounded.
         displacement_along_normal = np.where(
             self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0
         )
@@ -146,6 +147,7 @@ def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, fl
     is_own
         (n,), whether a node belongs to the shell.
     """
+    # nodes of the shell's supports
     is_held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
         own_dofs = support.dofs[support.dofs < x.size]
@@ -162,8 +164,8 @@ def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, fl
         # projection on the line; zero for a single point, which gives no direction
         along_line = np.outer(axes[:, 2], axes[:, 2]) if variances[2] > 0 else np.zeros((3, 3))
         across_line = np.eye(3) - along_line
-        # the covariance of the shell across the line, and a large eigenvalue along it: so the
-        # eigenvector with the least eigenvalue is across the line
+        # The covariance of the shell is taken across the line, with a large eigenvalue along it. So
+        # the eigenvector with the least eigenvalue is across the line.
         variances, axes = np.linalg.eigh(
             across_line @ covariance @ across_line + along_line * np.trace(covariance)
         )
@@ -205,10 +207,10 @@ def search_at_end_of_step(
     """
     if step.load.search:
         held_conjugates = held_conjugates_of_step(scene, step, begin)
-        name = step.name if step.name in end.mu else "lambda_m"  # of a turning field
-        for record in _solutions(
-            make_stage(scene, end, held_conjugates), name, end, step.load.search
-        ):
+        stage = make_stage(scene, end, held_conjugates)
+        # a step that turns the field has an angle, which is no amplitude of the state
+        name = step.name if step.name in end.mu else "lambda_m"
+        for record in _solutions(stage, name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 
 
@@ -279,7 +281,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
         is_late = search.seconds is not None and time.perf_counter() - start > search.seconds
         return bool(scene.comm.bcast(is_late))
 
-    # no steps are taken along it: the path corrects states at the present amplitude
+    # The path corrects states at the present amplitude. No steps are taken along it.
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     guesses = [partial(dents.settled, number) for number in range(dents.count)]
     limits = SearchLimits(search.solutions, search.guesses, is_over)
@@ -330,6 +332,10 @@ class _Dents:
     ----------
     count
         Number of dented shells.
+    _stage, _state
+        The parameters.
+    _guesses
+        Dented shells before they settle, as states of the model.
     """
 
     def __init__(self, stage: Stage, state: State) -> None:

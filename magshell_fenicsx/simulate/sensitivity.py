@@ -13,7 +13,7 @@ Words and symbols:
 - R is the residual Pi_u, the derivative of the potential energy by the displacement u; phi is the
   left null vector of the tangent at the fold. mu holds the amplitudes (load parameters) by name.
 - A load column of a parameter p is the vector R_p, zero at supports. One dot product with phi turns
-  it into the derivative of the fold's amplitude.
+  it into the derivative of the fold's amplitude; `continuation.fold.sensitivity` does so.
 - r0 is the undeformed mid-surface, a function of the chart (its coordinates). A deviation w0 is its
   distance from the perfect surface. A rim is the edge of a dimple; it may separate patches.
 - h and R are thickness and reference length; lambda_m is the strength of the magnetic field.
@@ -122,6 +122,7 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     """
     stage = stage_of_record(scene, record) if record else load_stage(scene)
     system, state, history = stage.newton.system, fold.state, scene.model.system.history
+    # load columns of the amplitudes, then of the remanence and of a field of strength zero
     columns = {
         name: system.load(state.u, state.mu, name)
         for name in state.mu
@@ -286,12 +287,13 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
     model, system = scene.model, scene.model.system
     column, terms = fem.Function(model.V), magnetic_terms(scene, state, field)
 
-    def add() -> None:
+    def add_forces() -> None:
+        """Add amplitude times dPi/du of each term to the column."""
         for term in terms:
             assert term.amplitude
             term.add_residual(column.x.array, state.mu.get(term.amplitude, 1.0))
 
-    system.at_state(state).evaluate(add)
+    system.at_state(state).evaluate(add_forces)
     column.x.scatter_reverse(InsertMode.add)  # contributions of other ranks at shared nodes
     for support in system.clamped:  # zero, as u = 0 there
         support.set(column.x.array)
@@ -307,6 +309,7 @@ def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence
         Magnetisation with this remanence. A soft material alone has no terms.
     """
     terms, fields = _magnetic_terms_and_fields(scene, field)
+    # fields that are known by their values have amplitudes of their own
     for applied in fields:
         applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
     return terms
@@ -385,8 +388,9 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     if scene.problem.axisymmetric and name.startswith("at."):
         return 0.0  # to first order an axisymmetric shell does not feel a centre beside the axis
     problem = scene.problem
-    unit = _unit(problem, key, name)
-    step, tiny = RESIDUAL_STEP * unit, DEVIATION_STEP * unit
+    # steps of both differences, over the scale of the number
+    scale = _scale_of_number(problem, key, name)
+    step, tiny = RESIDUAL_STEP * scale, DEVIATION_STEP * scale
     forward, backward = (
         _deviation(scene, with_changed_number(problem.imperfections, key, name, tiny_change), key)
         for tiny_change in (tiny, -tiny)
@@ -412,7 +416,7 @@ def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
 
     It is the change of the fold's amplitude to first order: at the fold's own displacement and
     amplitudes the other shell has a residual R that is not zero. Places in contact stay the same as
-    in the fold's state (`expand_contact`). Collective.
+    in the fold's state. Collective.
 
     Parameters
     ----------
@@ -422,7 +426,7 @@ def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
     scene, size = stage.scene, stage.scene.model.system.size
     assert same_mesh(scene, other)
     u, left_null_vector = (
-        # unknown amplitudes of a device follow the displacement
+        # unknown amplitudes of a loading device come after the displacement, and stay as they are
         np.concatenate([transfer(scene, other, vector[:size]), vector[size:]])
         for vector in (fold.state.u, fold.left_null_vector)
     )
@@ -440,9 +444,11 @@ def expand_contact(scene: Scene, other: Scene, state: State) -> None:
     """
     expand_shell_contact(scene, other, state)
     evaluation = scene.model.system.at_state(state)
-    for name, (pressing, _) in scene.model.contacts.items():
-        other_pressing, _ = other.model.contacts[name]
-        other_pressing.expand_about(evaluation.evaluate(partial(getattr, pressing, "gap")))
+    # the same body in both scenes
+    for name, (body_contact, _) in scene.model.contacts.items():
+        other_contact, _ = other.model.contacts[name]
+        gap_at_state = evaluation.evaluate(partial(getattr, body_contact, "gap"))
+        other_contact.expand_about(gap_at_state)
 
 
 def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
@@ -458,7 +464,7 @@ def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
     contacts: Sequence[Any] = scene.model.shell_contacts
     other_contacts: Sequence[Any] = other.model.shell_contacts
     for shell_contact, other_contact in zip(contacts, other_contacts, strict=True):
-        if shell_contact.held:
+        if shell_contact.held:  # the expansion that takes its place
             other_contact.hold(shell_contact.held)
         else:
             other_contact.expand_about(evaluation.evaluate(shell_contact.freeze))
@@ -499,7 +505,7 @@ def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
     return (forward - backward) / (2 * step)
 
 
-def _unit(problem: Problem, key: str, name: str) -> float:
+def _scale_of_number(problem: Problem, key: str, name: str) -> float:
     """Return the scale of a number of an imperfection, over which differences take their steps.
 
     Widths have their own value as the scale, angles of a centre the half-width of the imperfection
@@ -589,10 +595,11 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
     sections, key
         All imperfections, and the key of the one in question.
     """
-    problem, number = scene.problem, list(sections).index(key)
-    # by number, not by key: each dimple of random ones has a geometry of its own, with other keys
+    problem, position = scene.problem, list(sections).index(key)
+    # by position, not by key: each dimple of random ones has a geometry of its own, and such
+    # geometries have other keys than the sections
     geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
-    geometry = list(geometries.values())[number]
+    geometry = list(geometries.values())[position]
     turned_deviation = in_frame(geometry.deviation, problem.azimuth)
     return (
         _MirroredDeviation(turned_deviation, problem.mirror) if problem.mirror else turned_deviation

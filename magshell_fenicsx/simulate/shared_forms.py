@@ -43,6 +43,7 @@ class _NumbersOfForms:
 
     @value.setter
     def value(self, value: float) -> None:
+        """Put the numbers for another p in place."""
         if value == self._value:
             return
         for name, numbers in self.for_values[value].items():
@@ -59,12 +60,14 @@ class SharedForms:
     Parameters
     ----------
     scene, model
-        The scene, and its model.
+        The scene that has made the forms, and its model.
     places
         Name of a term -> the arrays of the model that its forms read.
 
     Attributes
     ----------
+    _scene, _model
+        This scene and its model.
     _numbers
         The numbers of all scenes, by p. Its p = inf stands for the first scene, as no other scene
         has this p.
@@ -93,11 +96,13 @@ class SharedForms:
         value
             The p of the problem.
         """
+        # a model without forms, which only gives its numbers
         model = build_meridian_model(problem, assembled=False)
         numbers, places = model.numbers(), self._numbers.places
         if numbers is None or _shapes(numbers) != _shapes(places):
             return None
         self._numbers.for_values[value] = _copied(numbers)
+        # it has the forms of the first model; each evaluation puts these numbers in place
         shared_model = self._model.with_numbers(model, self._numbers, value)
         return self._scene.with_model(problem, shared_model)
 

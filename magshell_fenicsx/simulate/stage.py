@@ -126,7 +126,7 @@ class Stage:
             _refuse_open(self.scene, name)
         scene = self.scene
         arguments = self.newton, name, control, options, scale, scene.journal, scene.progress
-        if scene.model.shell_contacts:
+        if scene.model.shell_contacts:  # steps end where shells first touch
             return Path(*arguments, partial(first_contact, scene, self.leave))
         return Path(*arguments)
 
@@ -137,8 +137,12 @@ class Stage:
 
         Parameters
         ----------
-        name, control, scale
-            As of `path`: the amplitude, what is prescribed, and the unit of the amplitude.
+        name
+            The amplitude that varies.
+        control
+            What is prescribed: "load", "conjugate" or "arc" (the arc length).
+        scale
+            Value of the amplitude that counts as of order one in the arc length.
         first
             About the change of the amplitude in the first step.
         """
@@ -147,11 +151,24 @@ class Stage:
     def resume(
         self, name: str, control: Control, state: State, first: float, scale: float = 1.0
     ) -> tuple[Path, Point]:
-        """Return a path and its first point as `begin` does, from a state of the step's system."""
-        # lengths of steps follow from the tangent at the start, which a path is needed for
+        """Return a path from a state of the step's system in equilibrium, and its first point.
+
+        Parameters
+        ----------
+        name
+            The amplitude that varies.
+        control
+            What is prescribed: "load", "conjugate" or "arc" (the arc length).
+        first
+            About the change of the amplitude in the first step.
+        scale
+            Value of the amplitude that counts as of order one in the arc length.
+        """
+        # a path gives the tangent at the start, from which its lengths of steps then follow
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
-        step = abs(first / start.dmu)  # of the controlled quantity s
+        # of the controlled quantity s, by the derivative dmu of the amplitude by s
+        step = abs(first / start.dmu)
         longest = LONGEST if control == "arc" else LONGEST_CONTROLLED
         return path.with_step_options(StepOptions(step, longest * step, SHORTEST * step)), start
 
@@ -189,7 +206,7 @@ def make_stage(
     state
         A state of the model in equilibrium.
     held_conjugates
-        Amplitude that becomes unknown -> its conjugate, see `Device`.
+        Amplitude that becomes unknown -> its conjugate: a number, or a function of the amplitude.
     curves
         Name of an amplitude, the amplitudes that are functions of it, and its value at the state.
 

@@ -6,8 +6,12 @@ Words and symbols:
   load parameter in `State.mu`. `step.load` is its section of the case.
 - The conjugate q = -dPi/dmu of an amplitude mu is the displacement on which it does work, with the
   potential energy Pi. A step may hold conjugates; their amplitudes are then unknowns.
-- A course says how a step goes on from where it begins; its drive has targets, control and first
-  change of the amplitude. The scale of an amplitude is a value of order one.
+- A course says how a step goes on from where it begins: `until` is the event at which its path
+  ends, `impossible` why there is no path, `forbidden` the function that gives a message about an
+  instability that must not be on the way, `at_once` whether such an instability ends the step at
+  once. Its `drive` has the targets on the way, the last one (`end`), the quantity that has them
+  (`quantity`), the quantity that is prescribed (`control`), and the first change of the amplitude
+  (`first`). The scale of an amplitude is a value of order one.
 - A stage is the scene with the solver of one step. Curves are amplitudes that the step varies
   together, as functions of its own one.
 - A located record is a fold or a bifurcation. Own modes are those that the model itself has.
@@ -74,6 +78,24 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         raise Stopped(course.impossible)
     if step.name in load.hold:  # the step's own load is then an unknown
         return (yield from _at_held_conjugate(scene, step, state, course.drive))
+    return (yield from _along_course(scene, step, state, course))
+
+
+def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepCourse) -> Records:
+    """Yield the records of a step at rest that drives its own load; collective.
+
+    Returns
+    -------
+    State
+        State of the model at its end (the generator's return value).
+
+    Raises
+    ------
+    Stopped
+        If the path is lost, an instability is on it that must not be, or it ends before its target.
+    """
+    load = step.load
+    # the targets that moving supports can reach, and why not all; "" if all
     drive, limit_reason = _within_support_limits(scene, step, state, course.drive)
     held_conjugates = held_conjugates_of_step(scene, step, state)
     stage = make_stage(scene, state, held_conjugates, course.curves and (step.name, *course.curves))
@@ -175,7 +197,7 @@ def follow_branch_of_step(scene: Scene, step: ProgrammeStep, bifurcation: Record
     stage, drive = stage_of_step(scene, step, state), _drive(scene, step, state)
     if drive.end is None:
         goal = ContinuationGoal("points", steps=step.load.points)
-    else:
+    else:  # to the target of the amplitude or of its conjugate
         goal = ContinuationGoal("target", [drive.end], drive.quantity)
     scale = abs(drive.scale)
     # 0: its records are those of the path itself, which goes on here
@@ -211,7 +233,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
     Parameters
     ----------
     drive
-        How the step drives its amplitude.
+        How the step drives its amplitude; the sign of its first change is the direction.
 
     Returns
     -------
@@ -219,7 +241,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
         State of the model at the end (the generator's return value).
     """
     held_conjugates, name = held_conjugates_of_step(scene, step, state), step.name
-    q = -scene.model.system.potential(state.u, state.mu, name)
+    q = -scene.model.system.potential(state.u, state.mu, name)  # where the step begins
     # conjugates besides that of the step's own load
     other_conjugates = {key: conjugate for key, conjugate in held_conjugates.items() if key != name}
     # the path under the load itself says how long steps are
@@ -240,6 +262,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 
 def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     """Return the stage of a step, a scene with its solver, from any state of the step."""
+    # amplitudes that are functions of the step's own one, and the value of this; None without
     curves = step.load.curves(_step_start(scene, step, state))
     held_conjugates = held_conjugates_of_step(scene, step, state)
     return make_stage(scene, state, held_conjugates, curves and (step.name, *curves))
@@ -292,13 +315,13 @@ def _step_start(scene: Scene, step: ProgrammeStep, state: State) -> StepStart:
         return model.system.potential(state.u, state.mu, name)
 
     return StepStart(
-        step,
-        problem.context,
-        problem.loads,
-        problem.azimuth,
-        problem.material.h,
-        state.mu,
-        potential,
-        scene.conjugate_unit,
-        bool(model.without_potential),
+        step=step,
+        context=problem.context,
+        loads=problem.loads,
+        turn=problem.azimuth,
+        h=problem.material.h,
+        mu=state.mu,
+        potential=potential,
+        unit=scene.conjugate_unit,
+        open=bool(model.without_potential),  # edges whose pressure has no potential
     )

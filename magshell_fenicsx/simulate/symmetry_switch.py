@@ -97,8 +97,9 @@ class SymmetrySwitch:
         Parameters
         ----------
         number
-            Number of the branch, see `Record.branch`.
+            Number of the branch; 0 on the path itself.
         """
+        # the point with displacement and amplitudes of the model, instead of the step's system
         point = self.stage.point(self.point)
         state = self.scene.model.system.advance(point.state, point.state.mu)
         return Record(
@@ -122,7 +123,7 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     bifurcation
         Its record.
     scale
-        Unit of the amplitude in the arc length of the branch, see `continuation.path.Path`.
+        Value of the amplitude that counts as of order one in the arc length of the branch.
 
     Raises
     ------
@@ -140,6 +141,7 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
         raise Stopped(
             f"the mode of the bifurcation ({bifurcation.mode}) is not found: {e}"
         ) from None
+    # displacement and mode in the unknowns of the new model; amplitudes that it alone has are zero
     u, phi = _carried_over(stage.scene, new_scene, bifurcation, mode)
     mu = {**new_scene.unloaded().mu, **bifurcation.point.state.mu}
     path = _arc_length_path(new_stage, bifurcation.amplitude, scale)
@@ -151,10 +153,9 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     else:
         located = path.recorded(partial(_located, new_stage, path, settled, phi))
     if isinstance(located, str):
+        model_words = new_scene.problem.included[0]  # the phrase that says what is modelled
         raise Stopped(
-            f"the bifurcation ({bifurcation.mode}) is not found in the "
-            f"{new_scene.problem.included[0]}: "
-            f"{located}"
+            f"the bifurcation ({bifurcation.mode}) is not found in the {model_words}: {located}"
         )
     switch = SymmetrySwitch(new_stage, path, located, unstable=bifurcation.excluded_pivots)
     return replace(switch, said=_differences(stage.scene, bifurcation, switch))
@@ -170,7 +171,7 @@ def _switch_in_same_model(stage: Stage, bifurcation: Record, scale: float) -> Sy
     stage, bifurcation
         Scene with the solver of the step, and the record of the bifurcation.
     scale
-        Unit of the amplitude in the arc length of the branch.
+        Value of the amplitude that counts as of order one in the arc length of the branch.
 
     Raises
     ------
@@ -196,7 +197,7 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
     scene
         Scene of the reduced model; the new scene shares its journal and listener.
     mode
-        Name of the mode, see `Record.mode`.
+        Name of the mode: "m = 7" or "antisymmetric".
 
     Raises
     ------
@@ -206,7 +207,7 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
     symmetries: list[int | str] = ["none"]
     if mode.startswith(WAVES):  # from the smallest model: the sector of 180/m degrees
         symmetries = [int(mode.removeprefix(WAVES)), "half", "none"]
-    first_reason = ""
+    first_reason = ""  # why the first one cannot be built
     for symmetry in symmetries:
         try:
             problem = scene.remesh(scene.problem.with_values({"symmetry": symmetry}))
@@ -214,6 +215,7 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
         except (CaseError, MeshError) as e:
             first_reason = first_reason or str(e)
             continue
+        # the journal goes on with the unknowns of the new model
         scene.journal.begin(new_scene.model.V)
         new_scene.journal, new_scene.progress = scene.journal, scene.progress
         return new_scene
@@ -234,7 +236,7 @@ def follow_switched_branch(
     goal
         Where the branch ends.
     scale
-        Unit of the amplitude in the arc length of the branch.
+        Value of the amplitude that counts as of order one in the arc length of the branch.
     number
         Number of the branch in its records; 0: the path itself goes on along it.
 
@@ -251,15 +253,18 @@ def follow_switched_branch(
     switch = switch_symmetry(stage, bifurcation, scale)
     yield switch.record(number)
     new_stage, at_switch = switch.stage, switch.point
+    # `passes` refuses a start to which a shell would pass through another one
     crossing = switch_branch(switch.path, at_switch, partial(passes, new_stage))
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
     system, u, phi = switch.scene.model.system, at_switch.state.u, at_switch.du
-    # the direction along the mode, not against it
+    # of the first points of the branch, in its two directions, that along the mode
     start = max(crossing.starts, key=lambda point: dot(system.comm, point.state.u - u, phi))
     records = RecordStream(follow_branch(new_stage, switch.path, start, goal, number))
     earlier_mu = at_switch.state.mu
     for record in records:
+        # the point with displacement and amplitudes of the model; its state then gets its history:
+        # angles of edges under moments, which go on from those of the point before
         point = new_stage.point(record.point)
         state = system.advance(point.state, earlier_mu)
         earlier_mu = state.mu
@@ -326,12 +331,14 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
     scene = stage.scene
     if not scene.model.shell_contacts:
         return guess
+    # cuts of this model at the guess, and the mode as a vector of the step's system
     state, mode = with_cuts_here(scene, guess), stage.padded(phi)
     for _ in range(MAX_CONTACT_CHANGES):
         point = path.recorded(partial(_at_rest, stage, path, state, mode))
         if isinstance(point, str):
             return point
         state = stage.leave(point.state)
+        # with stiffer penalties or better cuts; None if those of the state fit it
         changed_state = with_own_contact(scene, state)
         if changed_state is None:
             return state
@@ -342,7 +349,8 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
     """Return the point near a guess that a force along a mode holds at rest, or why there is none.
 
-    Its number of unstable directions is not known, and is set to 0.
+    The force keeps the component of the guess along the mode. The number of unstable directions at
+    the point is not known, and is set to 0.
 
     Parameters
     ----------
@@ -398,6 +406,7 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
     # columns of the results at the bifurcation, in both models
     old_row, new_row = old.observe(event.point.state), new_scene.observe(state)
     old_load, new_load = amount_of(old, name, event.point.state), amount_of(new_scene, name, state)
+    # relative changes of load and energy, and the change of w/h
     load_change = abs(new_load - old_load) / max(abs(old_load), TINY)
     old_energy = old_row["energy"]
     energy_change = abs(new_row["energy"] - old_energy) / max(abs(old_energy), TINY)
@@ -417,7 +426,10 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
 
 
 def amount_of(scene: Scene, name: str, state: State) -> float:
-    """Return the value of an amplitude at a state; lambda_m of a step that drives several."""
+    """Return the value of an amplitude at a state; lambda_m of a step that drives several.
+
+    The scene is not used here.
+    """
     return state.mu.get(name, state.mu.get("lambda_m", 0.0))
 
 
@@ -556,6 +568,7 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     comm, size = old.model.system.comm, old.model.system.size
     mirror = old.problem.mirror
     assert isinstance(mirror, Mirror)
+    # of all ranks: places, displacements and mode (n, 3) at the nodes of the half
     local_vectors = [old.model.r0.x.array[:size], u[:size], mode[:size]]
     places, *fields = (
         np.concatenate(comm.allgather(local_vector.reshape(-1, 3)))
@@ -563,12 +576,11 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     )
     # nodes of both halves: first those of the half, then the images of those off the plane
     has_image = mirror.signed_distance(places) > PLANE_TOLERANCE
-    reflection = mirror.reflection
     places_of_both_halves = np.concatenate([places, mirror.image(places[has_image])])
     # (nodes, 6): the displacement, and the mode with the negative of its image
     values = np.hstack(
         [
-            np.concatenate([field, sign * field[has_image] @ reflection])
+            np.concatenate([field, sign * field[has_image] @ mirror.reflection])
             for field, sign in zip(fields, (1.0, -1.0), strict=True)
         ]
     )
@@ -603,12 +615,15 @@ def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
         (n, 3).
     """
     count = min(NEIGHBOURS, len(x))
-    neighbours = scipy.spatial.cKDTree(x).query(places, count)[1].reshape(len(places), count)
+    # (n, count) numbers of the nodes nearest to each place
+    _, numbers = scipy.spatial.cKDTree(x).query(places, count)
+    neighbours = numbers.reshape(len(places), count)
     offsets = x[neighbours] - places[:, None]
     radius = np.linalg.norm(offsets, axis=2).max(axis=1)
     centred = offsets - offsets.mean(axis=1, keepdims=True)
-    # the two axes of the tangent plane, from the spread of the neighbours
-    axes = np.linalg.svd(centred, full_matrices=False)[2][:, :2]
+    # the two axes (n, 2, 3) of the tangent plane: those along which the neighbours spread most
+    _, _, principal_axes = np.linalg.svd(centred, full_matrices=False)
+    axes = principal_axes[:, :2]
     # coordinates (n, neighbours) of the neighbours in this plane, over the distance of the farthest
     coordinates = np.einsum("nki,nji->nkj", offsets, axes) / radius[:, None, None]
     a, b = np.moveaxis(coordinates, 2, 0)

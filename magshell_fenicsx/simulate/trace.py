@@ -84,11 +84,12 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
     if not isinstance(amount, str):
         raise ValueError(f'{place}: must be a number, or text with a unit such as "100 Pa"')
     column = amplitude(name).column if of_load else amplitude(name).conjugate
+    # unit of this quantity in the case, None without units; and the name of its unit in the model
     unit, scale = scene.sizes.unit(column), quantity(column).scale
     # conjugates with a unit: the change of volume of a pressure, the displacement of a force
     forces = (*scene.model.loads.forces, *scene.model.contacts)
     may_have_unit = of_load or name == "pressure" or name in forces
-    # the case's unit of this quantity; without one, any unit that says whether it can have a unit
+    # in a case without units, any unit of the quantity shows that a text could have one
     any_unit = next((unit_of_quantity.text for unit_of_quantity in quantity(column).units), "")
     text = unit.text if unit else any_unit
     if not (text and may_have_unit):
@@ -166,6 +167,7 @@ def trace(  # noqa: PLR0913
         )
     of_load = control == "load" or (control == "arc" and quantity == "load")
     targets = target_values(scene, name, "targets", targets, of_load=of_load)
+    # one amount gives one number
     first = None if first is None else target_values(scene, name, "first", first, of_load=True)[0]
     if until == "target" and not targets:
         raise ValueError("trace: until='target' needs targets")
@@ -177,22 +179,14 @@ def trace(  # noqa: PLR0913
         raise ValueError(
             f"trace: {name}: give first, the change of the amplitude in the first step, not zero"
         )
+    # the equilibrium at the start, at its amplitudes
     outcome = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
     if not outcome.converged:
         raise Stopped(
             f"there is no equilibrium to start from near the given state: {outcome.reason}"
         )
-    if control == "conjugate":  # a load that moves nothing has a conjugate that stays zero
-        displacement = scene.newton.response(
-            outcome.state, name, PrescribedLoad(name, 0.0), exact=True
-        ).du
-        system = scene.newton.system
-        largest = max_abs(system.comm, displacement) * abs(first)
-        if largest < ZERO_DISPLACEMENT * system.length:
-            raise Stopped(
-                f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by "
-                "arc length"
-            )
+    if control == "conjugate":
+        _refuse_without_effect(scene, name, outcome.state, first)
     # ten first steps are about the distance to a target: the scale of the amplitude
     path, first_point = load_stage(scene).begin(name, control, outcome.state, first, 10 * first)
     if targets and control == "conjugate":
@@ -205,6 +199,32 @@ def trace(  # noqa: PLR0913
     yield from _with_reached(
         (replace(record, shown=scene.displacement) for record in records), name, targets
     )
+
+
+def _refuse_without_effect(scene: Scene, name: str, state: State, change: float) -> None:
+    """Check that an amplitude moves the shell; the conjugate of one that does not stays zero.
+
+    Parameters
+    ----------
+    state
+        An equilibrium.
+    change
+        Change of the amplitude, whose displacement must not be negligible.
+
+    Raises
+    ------
+    Stopped
+        If it moves nothing.
+    """
+    # derivative of the displacement by the amplitude
+    du = scene.newton.response(state, name, PrescribedLoad(name, 0.0), exact=True).du
+    system = scene.newton.system
+    largest_displacement = max_abs(system.comm, du) * abs(change)
+    if largest_displacement < ZERO_DISPLACEMENT * system.length:
+        raise Stopped(
+            f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by "
+            "arc length"
+        )
 
 
 def _with_reached(

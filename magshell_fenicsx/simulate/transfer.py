@@ -43,22 +43,27 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     comm, system = source.model.system.comm, target.model.system
     if source.model is target.model:
         return u
+    # displacements (nodes, components) at all nodes of the source
     values = np.concatenate(comm.allgather(u.reshape(-1, source.model.V.dofmap.bs)))
-    matching = _matching(source, target)
-    if matching is not None:
-        return np.asarray(values[matching].ravel())
+    node_numbers = _matching(source, target)
+    if node_numbers is not None:  # the same mesh
+        return np.asarray(values[node_numbers].ravel())
     nodes, chart_places, stretch = _all_nodes(source), chart(target), _stretch(source, target)
     if stretch:
         places_in_source = stretch.place(chart_places)
-        u_at_places = _interpolated(nodes, values, places_in_source, stretch.source_rim)
+        u_at_places = _interpolated(nodes, values, places_in_source, rim=stretch.source_rim)
         displacement = stretch.turn(u_at_places, chart_places)
     else:
+        # the length of a system is the thickness
         scale = system.length / source.model.system.length
         displacement = np.zeros((len(chart_places), values.shape[1]))
         for source_nodes, target_nodes in nodes_by_shell(source, target):
             if target_nodes.any():
                 displacement[target_nodes] = scale * _interpolated(
-                    nodes[source_nodes], values[source_nodes], chart_places[target_nodes], np.inf
+                    nodes[source_nodes],
+                    values[source_nodes],
+                    chart_places[target_nodes],
+                    rim=np.inf,
                 )
     return system.zero_at_supports(displacement.ravel())
 
@@ -79,22 +84,22 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     """
     values_at_x: Array = np.zeros((len(x), values.shape[1]))
     polar_of_nodes, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
-    # for each side of the rim two masks, of nodes and of places; those on the rim are in both sides
+    # masks of nodes and of places for each side of the rim; those on the rim are in both sides
     within_rim = polar_of_nodes < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     beyond_rim = polar_of_nodes > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
     dim = nodes.shape[1]
     # a cubic polynomial in space may vanish on a surface, and so would not be determined by it
     kernel, degree = ("quintic", 3) if dim < 3 else ("linear", 0)
-    for is_source, is_target in (within_rim, beyond_rim):
-        if is_target.any():
+    for has_node, has_place in (within_rim, beyond_rim):
+        if has_place.any():
             field = scipy.interpolate.RBFInterpolator(
-                nodes[is_source],
-                values[is_source],
+                nodes[has_node],
+                values[has_node],
                 neighbors=NEIGHBOURS[dim],
                 kernel=kernel,
                 degree=degree,
             )
-            values_at_x[is_target] = field(x[is_target])
+            values_at_x[has_place] = field(x[has_place])
     return values_at_x
 
 
@@ -171,16 +176,23 @@ class _Stretch:
         """
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
-        # normal and meridian direction at the source, and at the target
-        from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
-        normal_part, meridian_part = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
-        sideways = u - normal_part * from_frame[0] - meridian_part * from_frame[1]
+        # unit vectors normal to the sphere and along the meridian, at the source and at the target
+        normal_at_source, meridian_at_source = _frame(self._polar(polar), azimuth)
+        normal, meridian = _frame(polar, azimuth)
+        # components (n, 1) along these vectors; the rest is across the meridian
+        normal_part, meridian_part = (
+            np.sum(u * e, axis=1, keepdims=True) for e in (normal_at_source, meridian_at_source)
+        )
+        sideways = u - normal_part * normal_at_source - meridian_part * meridian_at_source
         ratio = self.rim / self.source_rim
-        tangential = (meridian_part * to_frame[1] + sideways) / self._slope(polar)
-        return np.asarray(ratio**2 * (normal_part * to_frame[0] + tangential))
+        tangential = (meridian_part * meridian + sideways) / self._slope(polar)
+        return np.asarray(ratio**2 * (normal_part * normal + tangential))
 
     def _polar(self, polar: Array) -> Array:
-        """Return polar angles of the source from those of the target."""
+        """Return polar angles of the source from those of the target.
+
+        They are in proportion up to the rim. Beyond it a quadratic part makes the edges agree.
+        """
         part_beyond_rim = self._part_beyond_rim(polar)
         ratio = self.source_rim / self.rim
         return np.asarray(
@@ -191,7 +203,7 @@ class _Stretch:
         """Return the derivative of the source's polar angles by those of the target."""
         ratio, part_beyond_rim = self.source_rim / self.rim, self._part_beyond_rim(polar)
         slope = ratio + (1 - ratio) * self.edge * 2 * part_beyond_rim / (self.edge - self.rim)
-        return np.asarray(np.maximum(slope, 0.5))
+        return np.asarray(np.maximum(slope, 0.5))  # displacements are divided by it
 
     def _part_beyond_rim(self, polar: Array) -> Array:
         """Return a function that grows linearly from 0 at the rim to 1 at the edge."""
@@ -199,7 +211,7 @@ class _Stretch:
 
 
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
-    """Return unit vectors normal to the sphere and along its meridians.
+    """Return unit vectors (n, 2 or 3) normal to the sphere and along its meridians.
 
     Parameters
     ----------
@@ -208,9 +220,9 @@ def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
     azimuth
         Unit vectors of the azimuth (n, 1 or 2).
     """
-    return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack(
-        [np.cos(polar) * azimuth, -np.sin(polar)]
-    )
+    normal = np.hstack([np.sin(polar) * azimuth, np.cos(polar)])
+    meridian = np.hstack([np.cos(polar) * azimuth, -np.sin(polar)])
+    return normal, meridian
 
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
@@ -230,7 +242,9 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
             return None
         rims.append(shape.circles[0])
         edges.append(shape.radius)
-    return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
+    rim, source_rim = rims
+    edge, source_edge = edges
+    return _Stretch(rim, source_rim, edge) if abs(edge - source_edge) < ROUNDING else None
 
 
 def nodes_by_shell(
@@ -256,6 +270,7 @@ def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     A node belongs to the shells of its cells, ghosts included.
     """
     model = scene.model
+    # (cells, nodes of a cell), and the number of this rank's nodes
     nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
     return [
         np.isin(np.arange(count), nodes[np.flatnonzero(cells)].ravel())
@@ -289,7 +304,7 @@ def _all_nodes(scene: Scene) -> Array:
 def chart(scene: Scene) -> Array:
     """Return coordinates (n, 1 or 2) of this rank's nodes in the chart, independent of a defect.
 
-    For a solid with the height in its thickness: its displacements are carried to the same mesh
-    only. For a mesh file these are positions (n, 3).
+    Nodes of a solid have the height in the thickness as a further coordinate: displacements of
+    solids are carried to the same mesh only. Nodes of a mesh file have their positions (n, 3).
     """
     return scene.model.chart()

@@ -49,6 +49,8 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import make_stage
 
 Array = NDArray[np.float64]
+# amplitudes by name, and their first and second derivatives by time
+AmplitudesAndRates = tuple[dict[str, float], dict[str, tuple[float, float]]]
 MIN_POLE_DEFLECTION = 1e-6  # of a mode of size one: a smaller one does not give its sign
 MAX_SNAP_ANGLE = 2000.0  # rad of the third mode of vibration: duration of a snap
 SNAP_ROWS = 500
@@ -110,46 +112,57 @@ def motion_records(
     refinement = None
     if load.errors == "motion" and steps.fixed is None:  # coarser runs show the error at the rows
         refinement = StepRefinement(
-            scene, held_conjugates, marks, start.begin, row_times, end_of_motion
+            scene, held_conjugates, marks, start.begin, ends=row_times, is_over=end_of_motion
         )
     rows = MotionRows(scene, integrator, held_conjugates, steps, marks, refinement)
-    time_step, ending = steps.first, ""  # ending: the word of `until` that has come true
+    time_step = steps.first
     for row_time in row_times:
-        previous, first_step = motion, time_step
+        previous, first_step, has_ended = motion, time_step, False
+        # motion at this time, next time step, and point for the record
         motion, time_step, point = rows.journalled(previous, first_step, row_time)
         # the row moves from its time to that of the event
         if end_of_motion.event and end_of_motion.has_event(previous, motion):
             event_time = rows.crossing(previous, first_step, motion, end_of_motion.event)
             motion, time_step, point = rows.journalled(previous, first_step, event_time)
-            ending = "event"
+            has_ended = True
         clock = energies.clock(motion)
         excluded_pivots = _excluded_pivots(scene, point.state)
         state_at_rest = None
         if load.until == "rest" and energies.is_quiet:
             state_at_rest = _equilibrium_near(scene, held_conjugates, point.state)
         if load.until == "instability" and point.negative_pivots + excluded_pivots:
-            ending = "instability"
+            has_ended = True
         if load.until == "duration" and row_time == row_times[-1]:
-            ending = "duration"
+            has_ended = True
         record = Record("step", "time", point, excluded_pivots=excluded_pivots, clock=clock)
-        yield replace(record, label="target") if ending else record
+        yield replace(record, label="target") if has_ended else record
         if state_at_rest:
             clock = energies.clock_at_rest(motion, state_at_rest, clock)
             yield replace(
                 record, label="target", point=replace(point, state=state_at_rest), clock=clock
             )
             return state_at_rest
-        if ending:
-            supports = integrator.supports
-            # True: the velocity just before this time, at which it may jump
-            velocity = supports.velocity(motion.t, True) if supports else None
-            return MovingState(point.state.u, point.state.mu, motion.v, velocity)
+        if has_ended:
+            return _moving_state(integrator, motion, point.state)
+    raise _end_not_reached(load, energies)
+
+
+def _end_not_reached(load: TimeSection, energies: "_Energies") -> Stopped:
+    """Return the exception that a motion has not reached its end within its duration."""
     if load.until == "rest":
-        raise Stopped(
+        return Stopped(
             "the shell still moves at the end of its duration, kinetic energy "
             f"{energies.kinetic / energies.largest_kinetic:.2g} of its largest"
         )
-    raise Stopped(f"until: {load.until}: it has not come within the duration")
+    return Stopped(f"until: {load.until}: it has not come within the duration")
+
+
+def _moving_state(integrator: Integrator, motion: Motion, state: State) -> MovingState:
+    """Return the state at the end of a motion with its velocity, and with that of the supports."""
+    supports = integrator.supports
+    # True: the velocity just before this time, at which it may jump
+    ground_velocity = supports.velocity(motion.t, True) if supports else None
+    return MovingState(state.u, state.mu, v=motion.v, ground=ground_velocity)
 
 
 def snap_records(
@@ -182,9 +195,9 @@ def snap_records(
     """
     state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
     lowest_modes = ShellModes(scene.model).lowest(state, 3)
-    # without modes of other symmetries, which have a label
+    # without modes of other symmetries, which have a label; eigenvalues are squared frequencies
     eigenvalues = [mode.eigenvalue for mode in lowest_modes if not mode.label]
-    # of the highest of the three; the first one is neutral here
+    # frequency of the highest mode; the first one is neutral here
     omega = float(np.sqrt(max(eigenvalues[1:])))
     load = TimeSection(
         kind="time",
@@ -195,6 +208,7 @@ def snap_records(
         errors=snap.errors,
         until="rest",
     )
+    # the path's direction at a fold; the direction of a bifurcation's point is the mode
     direction = system.zero_at_supports(fold.point.du)
     push_length = snap.push * system.length / max_abs(system.comm, direction)
     pushed_state = State(state.u + push_length * direction, state.mu)
@@ -227,6 +241,8 @@ class _MotionStart:
     ----------
     loads
         The amplitudes as functions of time.
+    _scene, _load, _state, _held
+        The parameters.
     _drag
         Drag: a force over mass and velocity, in the unit of time of the model.
     _u, _v
@@ -256,22 +272,26 @@ class _MotionStart:
         """Return a new integrator, and the motion at time zero; collective."""
         scene, state, load = self._scene, self._state, self._load
         viscous = viscosity(scene, state)  # None of an elastic shell
-        # makes amplitudes with held conjugates unknowns; None without
+        # what makes amplitudes with held conjugates unknowns; None without such
         device = make_stage(scene, state, self._held).device
         supports = self._support_inertia(is_viscous=viscous is not None)
+        # name of a rigid body -> the contact with it
         body_contacts = {name: contact for name, (contact, _) in scene.model.contacts.items()}
         shell_contacts = scene.model.shell_contacts
         contact = None
         if body_contacts or shell_contacts:
             contact = ContactsInTime(scene.model.system, body_contacts, shell_contacts)
+        surroundings = Surroundings(
+            moving_amplitudes=load.drives, device=device, supports=supports, contact=contact
+        )
         integrator = Integrator(
             scene.model.system,
             mass(scene.model),
             self.loads,
-            load.rho_inf,
-            self._drag,
-            viscous,
-            Surroundings(load.drives, device, supports, contact),
+            rho=load.rho_inf,  # factor of a step by which high frequencies fade
+            drag=self._drag,
+            viscous=viscous,
+            surroundings=surroundings,
         )
         return integrator, integrator.begin(0.0, self._u, self._v)
 
@@ -291,12 +311,18 @@ class _MotionStart:
             raise CaseError(
                 f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest"
             )
+
+        def amplitudes_and_rates(t: float, before: bool) -> AmplitudesAndRates:
+            """Return amplitudes and their rates at a time; if wanted, those just before it."""
+            return loads(t, before), loads.rates(t, before, moving)
+
+        # velocity of the supports where the motion begins; None at rest
+        ground_velocity = state.ground if isinstance(state, MovingState) else None
         return SupportInertia(
             scene.model.system,
             mass_with_supports(scene.model),
-            # amplitudes and their rates at a time, or just before it
-            lambda t, before: (loads(t, before), loads.rates(t, before, moving)),
-            state.ground if isinstance(state, MovingState) else None,
+            amplitudes_and_rates,
+            ground_velocity,
         )
 
 
@@ -317,7 +343,10 @@ class _MotionEnd:
     event: Callable[[Motion], float] | None
 
     def has_event(self, previous: Motion, next_motion: Motion) -> bool:
-        """Return whether the event is between two motions, those of successive rows."""
+        """Return whether the event is between two motions, those of successive rows.
+
+        The function of the event changes its sign there, or is zero at one of them alone.
+        """
         if self.event is None:
             return False
         return self.event(previous) * self.event(next_motion) <= 0 and self.event(
@@ -371,7 +400,7 @@ class _Energies:
         The keys are time (in s of a case with units), and kinetic, dissipated, work and imbalance:
         energies over E h R^2 of the whole shell since the begin. Collective.
         """
-        multiplicity = self._scene.model.multiplicity
+        multiplicity = self._scene.model.multiplicity  # number of such models in the shell
         self.kinetic = self._integrator.kinetic(motion)
         self.largest_kinetic = max(self.largest_kinetic, self.kinetic)
         stored_energy = self._scene.model.system.stored_energy(motion.u, motion.mu)
@@ -420,6 +449,7 @@ def _excluded_pivots(scene: Scene, state: State) -> int:
 
     It is 0 for a shell that moves freely, whose rigid motions would count.
     """
+    # the modes that the model excludes by its symmetry, in families; None if there are none
     symmetry_breaking_modes = None if scene.free_in_time else scene.model.symmetry_breaking_modes
     return sum(symmetry_breaking_modes.counts(state)) if symmetry_breaking_modes else 0
 
@@ -463,6 +493,7 @@ def _equilibrium_near(
 
     Penalties of contact become stiffer until nothing penetrates too much. Collective.
     """
+    # the stage translates states between the model and the solver's system
     stage, comm = make_stage(scene, state, held_conjugates), scene.model.system.comm
     start = stage.enter(state)
     # the solver needs an amplitude to prescribe: here one that no load has
@@ -520,7 +551,8 @@ def pushed_along_mode(
     """
     comm = scene.model.system.comm
     modes = ShellModes(scene.model)
-    # modes of other symmetries have a label
+    # modes of other symmetries have a label; `vibrations` gives so many modes in all, `lowest` so
+    # many of each symmetry
     symmetric_modes = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
     if len(symmetric_modes) < push.mode:  # those of other symmetries were lower
         symmetric_modes = [mode for mode in modes.lowest(state, push.mode) if not mode.label]
@@ -572,12 +604,11 @@ def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, fl
         _, velocity = pushed_along_mode(scene, load.push, state, velocity)
     if not max_abs(scene.comm, velocity):
         return {}
+    # momentum M v
     M = mass(scene.model)
     mass_argument, momentum = M.createVecs()
     mass_argument.setArray(velocity)
     M.mult(mass_argument, momentum)
-    return {
-        "kinetic": scene.model.multiplicity
-        * dot(scene.comm, velocity, np.array(momentum.array_r))
-        / 2
-    }
+    # the model may be one of several equal parts of the shell
+    multiplicity = scene.model.multiplicity
+    return {"kinetic": multiplicity * dot(scene.comm, velocity, np.array(momentum.array_r)) / 2}

@@ -131,6 +131,7 @@ def parse_range(text: str) -> Range:
     """
     key, _, values = text.partition("=")
     bounds_and_steps = values.split(":")
+    # the values are first:last or first:last:steps
     try:
         if not re.fullmatch(r"\w+(\.\w+)*", key) or len(bounds_and_steps) not in (2, 3):
             raise ValueError
@@ -232,6 +233,7 @@ def boundary(
             Journal, folder / "points", _identity(source, span, make_case, begun_at.text)
         )
         value = _value(source, span, make_case, may_be_outside=not start)
+        # the instability at the start, as plain data
         begin = access_disk(
             comm, lambda: _begin(source, span, value, make_case, journal("start"), say, begun_at)
         )
@@ -240,7 +242,8 @@ def boundary(
         if name_of_mode == "antisymmetric":
             say_on_first_rank("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
-            whole_start = begun_at.anywhere()  # points have other numbers there
+            # the points of the whole shell's history have other numbers
+            whole_start = begun_at.anywhere()
             begin = access_disk(
                 comm,
                 lambda: _begin(source, span, value, make_case, journal("whole"), say, whole_start),
@@ -301,7 +304,7 @@ def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: boo
     """
     key_path = span.key.split(".")
     value_in_case = value_at(source.data, key_path)
-    if value_in_case is None:  # not written in the case: the default counts
+    if value_in_case is None:  # the case file does not have the key: its default counts
         value_in_case = value_at(make_case(source).model_dump(mode="json"), key_path)
     try:
         value = in_unit(str(value_in_case), span.unit)
@@ -385,17 +388,10 @@ def _begin(
     if journal.outcome:
         return journal.outcome
     scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
-    records, lost_reason = list[Record](), None
-    try:
-        for record in follow_alone(scene, remark=say):
-            records.append(record)
-            if start.complete(records):
-                break
-    except Stopped as e:  # what lies beyond an instability does not matter
-        lost_reason = e
+    records, lost_reason = _records_to_start(scene, start, say)
     try:
         instability = start.instability_in(records)
-    except CaseError:
+    except CaseError:  # there is none in these records
         if lost_reason:
             raise lost_reason from None
         if start.text:
@@ -415,6 +411,29 @@ def _begin(
     }
     journal.finish(outcome)
     return outcome
+
+
+def _records_to_start(scene: Scene, start: Start, say: Say) -> tuple[list[Record], Stopped | None]:
+    """Follow the history of a scene up to the instability at which the boundary starts.
+
+    A path that is lost keeps its records, as it may be lost beyond the instability.
+
+    Returns
+    -------
+    records
+        The points of the history.
+    lost_reason
+        The exception that says why the path was lost; None if it was not.
+    """
+    records = list[Record]()
+    try:
+        for record in follow_alone(scene, remark=say):
+            records.append(record)
+            if start.complete(records):  # no further points are needed
+                break
+    except Stopped as e:
+        return records, e
+    return records, None
 
 
 def _followed(
@@ -453,19 +472,7 @@ def _followed(
     Stopped
         If not even the start is found.
     """
-    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
-    u = vector_of(begin["u"])
-    # only the state of the point is known, and needed
-    point = Point(
-        State(u, begin["mu"]), s=0.0, du=0.0 * u, dmu=0.0, negative_pivots=0, negative_pivots_held=0
-    )
-    record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
-    try:
-        family = SceneFamily(
-            scene, record, partial(_problem, source, span, make_case), value, span.ends
-        )
-    except (CaseError, NoSystem) as e:
-        raise CaseError(f"--over {span.key}: {e}") from None
+    family = _scene_family(source, span, value, make_case, begin)
     # changes of load and key that count as of order one in the arc length of the boundary
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     rows: list[dict[str, Any]] = []
@@ -482,12 +489,7 @@ def _followed(
             # the rest is assumed to take as long in proportion
             elapsed = time.perf_counter() - start_time
             remaining = remaining_time_text(elapsed * (1 / covered_part - 1))
-        other_modes = f", {row['unstable']} other unstable" if row["unstable"] else ""
-        key_text = f"{row['key']:.9g} {span.unit}".rstrip()
-        say(
-            f"{span.key} = {key_text}: {row['kind']} at "
-            f"{load_text(row, family.name)}{other_modes}{remaining}"
-        )
+        say(_text_of_row(row, span, family.name) + remaining)
 
     def curve(m: int, start_point: BoundaryPoint | None = None) -> Boundary:
         """Return the boundary of modes with m waves around a meridian; 0: of the model itself.
@@ -517,6 +519,52 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": family.has_one_scene}
 
 
+def _scene_family(
+    source: Source, span: Range, value: float, make_case: MakeCase, begin: dict[str, Any]
+) -> SceneFamily:
+    """Return the scenes of the case for all values of the key, about the instability at the start.
+
+    Parameters
+    ----------
+    value
+        Value of the key at the start, in the unit of the range.
+    begin
+        The instability at the start.
+
+    Raises
+    ------
+    CaseError
+        If the key has no influence, or the instability cannot be followed.
+    """
+    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
+    u = vector_of(begin["u"])
+    # only the state of the point is known, and needed
+    point = Point(
+        State(u, begin["mu"]), s=0.0, du=0.0 * u, dmu=0.0, negative_pivots=0, negative_pivots_held=0
+    )
+    record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
+    make_problem = partial(_problem, source, span, make_case)
+    try:
+        return SceneFamily(scene, record, make_problem, value, value_range=span.ends)
+    except (CaseError, NoSystem) as e:
+        raise CaseError(f"--over {span.key}: {e}") from None
+
+
+def _text_of_row(row: dict[str, Any], span: Range, name: str) -> str:
+    """Return a row of boundary.csv as a line of text.
+
+    Parameters
+    ----------
+    span
+        Range of the key.
+    name
+        The amplitude of the load.
+    """
+    other_modes = f", {row['unstable']} other unstable" if row["unstable"] else ""
+    key_text = f"{row['key']:.9g} {span.unit}".rstrip()
+    return f"{span.key} = {key_text}: {row['kind']} at {load_text(row, name)}{other_modes}"
+
+
 def _row(
     family: SceneFamily, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
 ) -> dict[str, Any]:
@@ -539,7 +587,8 @@ def _row(
     name_of_mode
         Name of the model's own mode, as in path.csv of the case.
     """
-    # at a crossing two families are neutral: this boundary's and the one that it meets
+    # at a crossing two families are neutral: this boundary's and the one that it meets, whose
+    # neutral mode counts as unstable there
     is_crossing = label == "crossing"
     wave_numbers = sorted({mode.m, locus.met} if is_crossing else {mode.m})
     unstable = locus.unstable - (locus.unstable_of(locus.met) if is_crossing else 0)
@@ -561,8 +610,9 @@ def _row(
 
 def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
     """Return the columns of a load: `load`, and the load in the case's units if it has any."""
-    measured = sizes_in_units(problem).values({amplitude(name).column: value})
-    return {"load": float(value), **{column: float(number) for column, number in measured.items()}}
+    # column in units -> number; empty for a case without units
+    in_units = sizes_in_units(problem).values({amplitude(name).column: value})
+    return {"load": float(value), **{column: float(number) for column, number in in_units.items()}}
 
 
 def _put_together(
@@ -589,24 +639,10 @@ def _put_together(
     first_of_up = 1 if down["rows"] else 0
     rows = [*reversed(down["rows"]), *up["rows"][first_of_up:]]
     special = [row for row in rows if row["kind"] in SPECIAL]
-
-    def sentence(row: dict[str, Any]) -> str:
-        """Describe a special point in words."""
-        place = f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
-        words = CHANGED if "fold" in row["mode"] else WORDS_OF_KINDS[row["kind"]]
-        modes = f", {row['mode']}" if row["kind"] == "crossing" else ""
-        return f"{place}, {load_text(row, begin['amplitude'])}: {words}{modes}"
-
-    sentences = [sentence(row) for row in special]
-    # a boundary that has not stopped, but does not reach an end of the range, turns back before
     stopped = [outcome["stopped"] for outcome in (down, up) if outcome["stopped"]]
-    key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
-    for end, key in zip(sorted((span.first, span.last)), key_range, strict=True):
-        if not stopped and abs(key - end) > END_TOLERANCE * abs(span.last - span.first):
-            sentences.append(
-                f"between {span.text(end)} and {span.text(key)} it has no points: it turns back "
-                "before"
-            )
+    sentences = [_sentence_of_special(row, span, begin["amplitude"]) for row in special]
+    if not stopped:
+        sentences += _sentences_of_unreached_ends(rows, span)
     content = {
         "case": name,
         "settings": list(settings),
@@ -628,6 +664,41 @@ def _put_together(
         "stopped": stopped,
     }
     return StabilityBoundary(rows, content)
+
+
+def _sentence_of_special(row: dict[str, Any], span: Range, name: str) -> str:
+    """Describe a special point of the boundary, such as a cusp, in words.
+
+    Parameters
+    ----------
+    row
+        Its row of boundary.csv.
+    span
+        Range of the key.
+    name
+        The amplitude of the load.
+    """
+    place = f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
+    # a crossing with a fold has its kind as the name of a mode
+    words = CHANGED if "fold" in row["mode"] else WORDS_OF_KINDS[row["kind"]]
+    modes = f", {row['mode']}" if row["kind"] == "crossing" else ""
+    return f"{place}, {load_text(row, name)}: {words}{modes}"
+
+
+def _sentences_of_unreached_ends(rows: list[dict[str, Any]], span: Range) -> list[str]:
+    """Return a sentence for each end of the range that a boundary does not reach.
+
+    If nothing has stopped the boundary, it turns back before such an end.
+    """
+    sentences = list[str]()
+    key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
+    for end, key in zip(span.ends, key_range, strict=True):
+        if abs(key - end) > END_TOLERANCE * abs(span.last - span.first):
+            sentences.append(
+                f"between {span.text(end)} and {span.text(key)} it has no points: it turns back "
+                "before"
+            )
+    return sentences
 
 
 def _write(stability_boundary: StabilityBoundary, folder: Path) -> None:

@@ -30,8 +30,10 @@ class Journal:
 
     Attributes
     ----------
+    _folder
+        Folder of the files.
     _name
-        Begin of the names of the files, of identity and part.
+        Begin of the names of the files, made of identity and part.
     _count
         Number of solves so far, stored or computed.
 
@@ -82,7 +84,7 @@ class Journal:
 
 
 def text_of(v: Vector) -> str:
-    """Return a vector as text, bit by bit."""
+    """Return a vector as text that has its bytes (base 64), so that nothing is rounded."""
     return base64.b64encode(np.ascontiguousarray(v).tobytes()).decode()
 
 

@@ -45,6 +45,7 @@ def second_axis(text: str, first: str) -> Axis:
         If the text is no list of numbers of one other key, each once.
     """
     axis = parse_axis(text)
+    # one other number of the shell or its loads
     if (
         len(axis.keys) > 1
         or axis.numbers is None
@@ -56,6 +57,7 @@ def second_axis(text: str, first: str) -> Axis:
             "written as "
             "key.path=first:last:count or key.path=value,value,..."
         )
+    # each value once, in whatever unit it is written
     numbers = [axis.number(value) for value in axis.values]
     if repeated := next(
         (value for i, value in enumerate(axis.values) if numbers[i] in numbers[:i]), None
@@ -105,19 +107,7 @@ def boundary_map(
     """
     if len(overs) == 1:
         return boundary(file, overs[0], settings, out, comm, say, make_case=make_case, start=start)
-    if start:
-        raise CaseError(
-            f"--from {start}: a map starts at the end of each of its cases: give one --over"
-        )
-    if len(overs) != 2:
-        raise CaseError(
-            f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two"
-        )
-    span = parse_range(overs[0])
-    axis = second_axis(overs[1], span.key)
-    for setting in settings:
-        if setting.partition("=")[0].strip() == axis.name:
-            raise CaseError(f"--set {setting}: this key is swept by --over")
+    axis = _second_axis_of_map(overs, settings, start)
     folder, say_on_first_rank = user_folder(out), say if comm.rank == 0 else (lambda line: None)
     # rows of the table; and by values of the second key why there is no boundary, or the boundary
     rows = list[dict[str, Any]]()
@@ -161,10 +151,34 @@ def boundary_map(
     return stability_map
 
 
+def _second_axis_of_map(overs: Sequence[str], settings: Sequence[str], start: str | None) -> Axis:
+    """Check the arguments of a map, and return its second key with its values.
+
+    Raises
+    ------
+    CaseError
+        If there is a start, there are not two keys, one of them is not valid, or a setting has the
+        second key.
+    """
+    if start:
+        raise CaseError(
+            f"--from {start}: a map starts at the end of each of its cases: give one --over"
+        )
+    if len(overs) != 2:
+        raise CaseError(
+            f"--over: {len(overs)} keys; a boundary takes one, and a map of boundaries two"
+        )
+    axis = second_axis(overs[1], first=parse_range(overs[0]).key)
+    for setting in settings:
+        if setting.partition("=")[0].strip() == axis.name:
+            raise CaseError(f"--set {setting}: this key is swept by --over")
+    return axis
+
+
 def _content(
     file: Path | str,
     settings: Sequence[str],
-    lines: dict[str, StabilityBoundary],
+    boundaries: dict[str, StabilityBoundary],
     without: dict[str, str],
     axis: Axis,
 ) -> dict[str, Any]:
@@ -172,23 +186,24 @@ def _content(
 
     Parameters
     ----------
-    lines
+    boundaries
         Value of the second key as text -> its boundary.
     without
         Value of the second key as text -> why it has no boundary.
     axis
         The second key.
     """
-    first_content = next(iter(lines.values())).content
-    loads = [line.content["load"] for line in lines.values()]
+    # all boundaries have the first key and its range alike
+    first_content = next(iter(boundaries.values())).content
+    loads = [line.content["load"] for line in boundaries.values()]
     special = [
         {"second": axis.number(value), **row}
-        for value, line in lines.items()
+        for value, line in boundaries.items()
         for row in line.special
     ]
     sentences = [
         f"{axis.name} = {value}: {text}"
-        for value, line in lines.items()
+        for value, line in boundaries.items()
         for text in line.content["said"]
     ]
     return {
@@ -201,13 +216,15 @@ def _content(
         "load": max(loads, key=loads.count),  # the most frequent amplitude
         "kinds": {
             value: f"{line.content['kind']} {line.content['mode']}".strip()
-            for value, line in lines.items()
+            for value, line in boundaries.items()
         },
         "special": special,
         "said": sentences + [f"{axis.name} = {value}: no boundary" for value in without],
         "without": without,
         "stopped": [
-            f"{axis.name} = {value}: {why}" for value, line in lines.items() for why in line.stopped
+            f"{axis.name} = {value}: {why}"
+            for value, line in boundaries.items()
+            for why in line.stopped
         ],
     }
 

@@ -53,27 +53,21 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
 
     rows, label = _in_units(rows, content["load"])
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    # the boundary has a corner where two bifurcations cross: each mode has a smooth line
     mode_parts = [part for _, part in _by_mode(rows)]
-    for smooth_part in mode_parts:  # the boundary has a corner where two bifurcations cross
-        # intervals between neighbouring points, dashed if an end has other unstable modes
-        intervals_by_style = groupby(
-            pairwise(smooth_part), key=lambda ends: bool(ends[0]["unstable"] or ends[1]["unstable"])
-        )
-        # one line joins the neighbouring intervals of one style
-        for unstable, group in intervals_by_style:
-            intervals = [*group]
-            line = [intervals[0][0], *(second_end for _, second_end in intervals)]
-            _line(plot, line, color="C0", linestyle="--" if unstable else "-")
+    for smooth_part in mode_parts:
+        _dashed_line(plot, smooth_part)
     plot.margins(y=0.2 if len(mode_parts) > 1 else None)
     _marks(plot, "load", rows)
     for x, y, region_name in _regions(rows, content, plot.get_ylim()):
         plot.annotate(region_name, (x, y), ha="center", va="center", color="0.35")
     arms = _arms(rows)
     if arms:  # shade the region between two folds
-        low, high = arms
+        first_arm, second_arm = arms
+        # along one arm and back along the other, for x and for y
         x, y = (
-            np.concatenate([lower_point, upper_point[::-1]])
-            for lower_point, upper_point in zip(_smoothed(low), _smoothed(high), strict=True)
+            np.concatenate([along, back[::-1]])
+            for along, back in zip(_smoothed(first_arm), _smoothed(second_arm), strict=True)
         )
         plot.fill(x, y, color="C0", alpha=0.12, linewidth=0)
     plot.set(xlabel=key_label(content["key"], content["unit"]), ylabel=label, title=_title(content))
@@ -81,6 +75,20 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
         plot.legend(frameon=False, fontsize=8)
     figure.savefig(file, dpi=200)
     plt.close(figure)
+
+
+def _dashed_line(plot: Any, rows: Sequence[Row]) -> None:
+    """Draw the boundary of one mode, dashed where other modes are unstable."""
+    # intervals between neighbouring points, dashed if an end has other unstable modes
+    intervals_by_style = groupby(
+        pairwise(rows), key=lambda ends: bool(ends[0]["unstable"] or ends[1]["unstable"])
+    )
+    # one line joins the neighbouring intervals of one style
+    for unstable, group in intervals_by_style:
+        intervals = [*group]
+        first_end, _ = intervals[0]
+        line = [first_end, *(second_end for _, second_end in intervals)]
+        _line(plot, line, color="C0", linestyle="--" if unstable else "-")
 
 
 def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:
@@ -104,6 +112,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     # at some second values another load may lead to the instability
     rows_of_other_loads = [row for row in rows if row["amplitude"] != content["load"]]
     values_without_boundary = sorted(set(content["values"]) - {row["second"] for row in rows})
+    # the second panel, if there is something to show in it
     with_plane = bool(
         rows_of_other_loads or values_without_boundary or any(row["kind"] in MARKS for row in rows)
     )
@@ -115,6 +124,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     names = [
         key_label(key, unit) for key, unit in zip(content["keys"], content["units"], strict=True)
     ]
+    # a line for each second value, coloured by the value, unless another load leads there
     shade = plt.Normalize(min(content["values"]), max(content["values"]))
     for value in sorted({row["second"] for row in rows}, reverse=True):
         line = [row for row in rows if row["second"] == value]
@@ -212,7 +222,8 @@ def _smoothed(places: Sequence[tuple[float, float]], located: Sequence[bool] = (
     Parameters
     ----------
     located
-        Whether each place is a special point, such as a cusp.
+        Whether each place is a special point, such as a cusp; a curve that turns there turns
+        exactly at it.
     """
     x, y = zip(*places, strict=True)
     return smooth(x, y, located)
@@ -260,7 +271,7 @@ def _regions(
         return all_regions
     # the stable regions of the whole boundary, and the region beyond each mode's part of it
     extent = np.ptp([row["key"] for row in rows])
-    regions = [region for region in all_regions if region[2] == "stable"]
+    regions = [(x, y, words) for x, y, words in all_regions if words == "stable"]
     for mode, part in mode_parts:
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
@@ -305,7 +316,8 @@ def _regions_of_mode(
     )
     if not loads_at_middle:
         return []
-    # outer: away from load zero, which is up for positive loads and down for negative ones
+    # limits of the axis: the outer one is away from load zero, which is up for positive loads and
+    # down for negative ones
     least_load, largest_load = loads_at_middle[0], loads_at_middle[-1]
     if np.mean(loads_at_middle) > 0:
         inner, outer = limits

@@ -62,6 +62,7 @@ class Start:
         """
         if not self.text:
             return first_instability(records)
+        # folds and bifurcations with nearly the load of the start
         candidates = [
             r
             for r in records
@@ -75,7 +76,10 @@ class Start:
         return min(candidates, key=lambda r: abs(_load(r) - self.load))
 
     def anywhere(self) -> "Start":
-        """Return the same instability for a history of other points, as of the whole shell."""
+        """Return the start for a history whose points have other numbers, as of the whole shell.
+
+        The instability is then found by its load alone.
+        """
         return replace(self, point=-1)
 
 
@@ -106,6 +110,7 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
         raise CaseError(f"--from {text}: {e}") from None
     if not data:
         raise CaseError(f"--from {text}: {folder} has no run")
+    # number of a point -> its row, of folds and bifurcations
     located: dict[Any, Any] = {row["point"]: row for row in rows if row["label"] in LOCATED}
     if point not in located:
         numbers = (
@@ -115,6 +120,7 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
             f"--from {text}: is no fold or bifurcation of this run; these are {numbers}"
         )
     row = located[point]
+    # the amplitude that varies there
     load = float(row[amplitude(row["amplitude"]).column])
     # places in the file, for messages, are not those of the stored case
     return Start(text, point, load), replace(source, data=data, places={})

@@ -81,7 +81,15 @@ class NothingLeft(RuntimeError):
 
 @dataclass(frozen=True)
 class Used:
-    """The content of usage.json of a run: the request, and the times of the process."""
+    """The content of usage.json of a run.
+
+    Attributes
+    ----------
+    asked
+        The request: text and settings of the case, and the sources.
+    cpu_s, wall_s
+        Times of the process.
+    """
 
     asked: dict[str, Any]
     cpu_s: float
@@ -129,43 +137,104 @@ def run_model(
         "settings": model_settings,
         "sources": code_version(),
     }
-    usage, results, reason = stored_outcome(folder / "usage.json", TypeAdapter(Used)), None, ""
-    if usage and usage.asked == request:
-        try:
-            results = read_summary(folder), read_lines(folder / "path.csv")
-        except (OSError, Damaged) as e:
-            reason = str(e)
-    # the same but for the sources
-    elif usage and usage.asked | {"sources": request["sources"]} == request:
-        reason = "the folder has results of other sources of magshell_fenicsx"
+    usage = stored_outcome(folder / "usage.json", TypeAdapter(Used))
+    results, reason = _stored_results(folder, usage, request)
     if reason:
         say(f"{model} at refinement {refinement:g}: computed again, {reason}")
     if not (usage and results):  # no stored run serves
-        name = _case_in(folder)
-        if name and Path(name).stem != case.stem:
-            raise CaseError(
-                f"--out {folder.parent}: has a comparison of {name}, which is kept; give another "
-                "folder"
-            )
-        arguments = [argument for setting in model_settings for argument in ("--set", setting)]
-        measured = measure(
-            "magshell_fenicsx", ["run", str(case), *arguments, "--out", str(folder), "--overwrite"]
-        )
-        # exit code 3: stopped early, with results
-        if not (folder / "summary.json").exists() or measured.code not in (0, 3):
-            raise NothingLeft(
-                f"model: {model}: {measured.last_error or f'exit code {measured.code}'}"
-            )
-        results = read_summary(folder), read_lines(folder / "path.csv")
-        # the sources that the run has recorded itself
-        usage = Used({**request, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
-        keep(folder / "usage.json", asdict(usage))
+        _refuse_another_case(folder, case)
+        usage, results = _run_in_process(case, model, folder, request)
     summary, rows = results
     # the time for the compilation of kernels, which later runs do not need
     compiling = float(summary["timing"]["jit_s"])
     return ModelRun(
         model, refinement, summary, rows, usage.cpu_s - compiling, usage.wall_s - compiling
     )
+
+
+# the content of summary.json and of path.csv
+Results = tuple[dict[str, Any], list[dict[str, str]]]
+
+
+def _stored_results(
+    folder: Path, usage: Used | None, request: Mapping[str, Any]
+) -> tuple[Results | None, str]:
+    """Return the results of the run in a folder, and why they do not serve.
+
+    Parameters
+    ----------
+    usage
+        The content of usage.json there; None if there is none.
+    request
+        Case, settings and sources of the run that is needed.
+
+    Returns
+    -------
+    results
+        Those of the same request; None if there are none.
+    reason
+        Why the run of this case is computed again; "" if it serves, or if there is none.
+    """
+    if usage and usage.asked == request:
+        try:
+            return (read_summary(folder), read_lines(folder / "path.csv")), ""
+        except (OSError, Damaged) as e:
+            return None, str(e)
+    # the same but for the sources
+    if usage and usage.asked | {"sources": request["sources"]} == request:
+        return None, "the folder has results of other sources of magshell_fenicsx"
+    return None, ""
+
+
+def _refuse_another_case(folder: Path, case: Path) -> None:
+    """Check that a folder has no run of another case.
+
+    Raises
+    ------
+    CaseError
+        With the name of the other case.
+    """
+    name = _case_in(folder)
+    if name and Path(name).stem != case.stem:
+        raise CaseError(
+            f"--out {folder.parent}: has a comparison of {name}, which is kept; give another folder"
+        )
+
+
+def _run_in_process(
+    case: Path, model: ModelName, folder: Path, request: Mapping[str, Any]
+) -> tuple[Used, Results]:
+    """Run a case in a process of its own into a folder, and write its usage.json.
+
+    Parameters
+    ----------
+    request
+        Case, settings and sources of the run.
+
+    Returns
+    -------
+    usage
+        The content of usage.json: the request with the sources that have run, and the times.
+    results
+        The content of summary.json and of path.csv.
+
+    Raises
+    ------
+    NothingLeft
+        If the run leaves no results.
+    """
+    arguments = [argument for setting in request["settings"] for argument in ("--set", setting)]
+    measured = measure(
+        "magshell_fenicsx", ["run", str(case), *arguments, "--out", str(folder), "--overwrite"]
+    )
+    # exit code 3: stopped early, with results
+    if not (folder / "summary.json").exists() or measured.code not in (0, 3):
+        raise NothingLeft(f"model: {model}: {measured.last_error or f'exit code {measured.code}'}")
+    summary, rows = read_summary(folder), read_lines(folder / "path.csv")
+    # the sources that the run has recorded itself
+    usage = Used({**request, "sources": summary["sources"]}, measured.cpu_s, measured.wall_s)
+    keep(folder / "usage.json", asdict(usage))
+    return usage, (summary, rows)
 
 
 def _case_in(folder: Path) -> str:
@@ -269,7 +338,9 @@ def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
 
 def load_at(run: ModelRun, w: float) -> float | None:
     """Return the load of a run at a displacement w/h; None if the run does not reach it."""
-    return Scalar("", amplitude(amplitude_of(run)).column, W, w).value_in(run.summary, loaded(run))
+    # the column of the load, where the displacement first has this value
+    load = Scalar("", column=amplitude(amplitude_of(run)).column, at=W, value=w)
+    return load.value_in(run.summary, loaded(run))
 
 
 def judge(
@@ -377,18 +448,7 @@ def compare(
         If a run left no results.
     """
     file, folder, scalar = Path(file), user_folder(out), parse_scalar(result) if result else None
-    # both must be valid; the programme of loads is the same
-    for model in MODELS:
-        case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
-    load_name = case.programme[-1].name if case.programme else ""
-    if (
-        not load_name
-        or load_name in UNCOMPARED
-        or (load_name == "lambda_m" and case.loading is None)  # a field alone
-    ):
-        raise CaseError(
-            "compare: needs a load whose curve can be compared: pressure, indentation or field"
-        )
+    _refuse_incomparable(file, settings, make_case)
     runs: dict[ModelName, list[ModelRun]] = {model: [] for model in MODELS}
 
     def computed(task: tuple[ModelName, float]) -> Iterator[str]:
@@ -431,6 +491,28 @@ def compare(
         title = f"{file.name} {' '.join(settings)}".strip()
         draw_comparison(shell, solid, curve_differences, errors, title, folder / "compare.png")
     return Comparison(curve_differences, content)
+
+
+def _refuse_incomparable(file: Path, settings: Sequence[str], make_case: MakeCase) -> None:
+    """Check that a case is valid for both models, and has a load whose curve can be compared.
+
+    Raises
+    ------
+    CaseError
+        If it is not valid, or its last load is none, an angle, a time or a field alone.
+    """
+    for model in MODELS:
+        case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
+    # the programme of loads is the same for both models
+    load_name = case.programme[-1].name if case.programme else ""
+    if (
+        not load_name
+        or load_name in UNCOMPARED
+        or (load_name == "lambda_m" and case.loading is None)  # a field alone
+    ):
+        raise CaseError(
+            "compare: needs a load whose curve can be compared: pressure, indentation or field"
+        )
 
 
 def _write(content: Mapping[str, Any], differing: Sequence[Difference], folder: Path) -> None:
@@ -483,11 +565,11 @@ def _content(
     differing
         Differences between the curves of the finest runs.
     scalar
-        The requested number; None for the default, see `judge`.
+        The requested number; None for k_d, or the load at the judged place if a run has no k_d.
     """
-    # for each model: what is said of its runs, the limit of their values, and the CPU time that an
+    # for each model: plain data of its runs, the limit of their values, and the CPU time that an
     # error of one percent takes
-    accounts: dict[ModelName, list[dict[str, Any]]] = {}
+    data_of_runs: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
     name, value_of = judge(
@@ -495,38 +577,47 @@ def _content(
     )
     for model, runs_of_model in runs.items():
         values = [value_of(run) for run in runs_of_model]
+        # by Richardson extrapolation; None if it is not known
         limit = extrapolated(values, [run.refinement for run in runs_of_model])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
-        accounts[model] = [
-            {
-                "refinement": run.refinement,
-                "dofs": run.dofs,
-                "value": value,
-                "error": error,
-                "cpu_s": run.cpu_s,
-                "wall_s": run.wall_s,
-                "factorisations": run.summary["factorisations"],
-                "stopped": run.summary["stopped"],
-            }
+        data_of_runs[model] = [
+            _data_of_run(run, value, error)
             for run, value, error in zip(runs_of_model, values, errors, strict=True)
         ]
         limits[model] = limit
-        measured = [
+        errors_and_seconds = [
             (e, run.cpu_s) for e, run in zip(errors, runs_of_model, strict=True) if e is not None
         ]
-        seconds[model] = time_at(ONE_PERCENT, measured)
-    # of the finest runs; the order of the models is shell, solid
-    final_values = [accounts[model][-1]["value"] for model in MODELS]
-    times = [seconds[model] for model in MODELS]
+        seconds[model] = time_at(ONE_PERCENT, errors_and_seconds)
+    # of the finest runs
+    shell_value, solid_value = (data_of_runs[model][-1]["value"] for model in MODELS)
+    has_both_values = None not in (shell_value, solid_value)
+    shell_seconds, solid_seconds = (seconds[model] for model in MODELS)
     return {
         "result": name,
         # of the solid from the shell
-        "difference": final_values[1] / final_values[0] - 1 if None not in final_values else None,
+        "difference": solid_value / shell_value - 1 if has_both_values else None,
         "largest_difference_of_the_curves": max((abs(d.relative) for d in differing), default=None),
         "limits": limits,
         "seconds_to_one_percent": seconds,
-        "ratio_at_one_percent": times[1] / times[0] if times[0] and times[1] else None,
-        "runs": accounts,
+        "ratio_at_one_percent": solid_seconds / shell_seconds
+        if shell_seconds and solid_seconds
+        else None,
+        "runs": data_of_runs,
+    }
+
+
+def _data_of_run(run: ModelRun, value: float | None, error: float | None) -> dict[str, Any]:
+    """Return a run with its compared number and the relative error of this, as in compare.json."""
+    return {
+        "refinement": run.refinement,
+        "dofs": run.dofs,
+        "value": value,
+        "error": error,
+        "cpu_s": run.cpu_s,
+        "wall_s": run.wall_s,
+        "factorisations": run.summary["factorisations"],
+        "stopped": run.summary["stopped"],
     }
 
 
@@ -570,6 +661,8 @@ def draw_comparison(
 
     Parameters
     ----------
+    differing
+        Differences between these curves; without any the panel is left out.
     errors
         Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left
         out.
@@ -585,24 +678,8 @@ def draw_comparison(
     y_label = quantity(load_amplitude.column).label
     # the curves, then the differences if there are any, and last the errors if there are any
     first, *other_panels = figure.subplots(1, panels, squeeze=False)[0]
-    first.plot(
-        *curve(shell),
-        ".-",
-        color="C0",
-        markersize=4,
-        linewidth=1,
-        label=f"shell, {shell.dofs} unknowns",
-    )
-    first.plot(
-        *curve(solid),
-        "o",
-        color="C3",
-        markersize=4,
-        fillstyle="none",
-        label=f"solid, {solid.dofs} unknowns",
-    )
+    _draw_curves(first, shell, solid)
     first.set(xlabel=x_label, ylabel=y_label)
-    first.legend(frameon=False, fontsize=8)
     if differing:
         other_panels[0].plot(
             [d.w_over_h for d in differing], [100 * d.relative for d in differing], ".-", color="C3"
@@ -610,15 +687,45 @@ def draw_comparison(
         other_panels[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
         other_panels[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
     if any(errors.values()):
-        for (model, points), color in zip(errors.items(), ("C0", "C3"), strict=True):
-            if times_and_errors := sorted((s, e) for e, s in points):
-                other_panels[-1].loglog(
-                    *zip(*times_and_errors, strict=True), "o-", color=color, label=model
-                )
-        other_panels[-1].set(
-            xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit"
-        )
-        other_panels[-1].grid(which="both", color="0.92")
-        other_panels[-1].legend(frameon=False, fontsize=8)
+        _draw_errors(other_panels[-1], errors)
     figure.suptitle(title, fontsize=9)
     figure.savefig(file)
+
+
+def _draw_curves(plot: Any, shell: ModelRun, solid: ModelRun) -> None:
+    """Draw load over displacement of both models on the axes `plot`."""
+    plot.plot(
+        *curve(shell),
+        ".-",
+        color="C0",
+        markersize=4,
+        linewidth=1,
+        label=f"shell, {shell.dofs} unknowns",
+    )
+    plot.plot(
+        *curve(solid),
+        "o",
+        color="C3",
+        markersize=4,
+        fillstyle="none",
+        label=f"solid, {solid.dofs} unknowns",
+    )
+    plot.legend(frameon=False, fontsize=8)
+
+
+def _draw_errors(plot: Any, errors: Errors) -> None:
+    """Draw error over CPU time of both models on the axes `plot`, with logarithmic scales.
+
+    Parameters
+    ----------
+    errors
+        Model -> (relative error, CPU seconds) of its coarser runs.
+    """
+    for (model, errors_and_seconds), color in zip(errors.items(), ("C0", "C3"), strict=True):
+        if seconds_and_errors := sorted((s, e) for e, s in errors_and_seconds):
+            plot.loglog(*zip(*seconds_and_errors, strict=True), "o-", color=color, label=model)
+    plot.set(
+        xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit"
+    )
+    plot.grid(which="both", color="0.92")
+    plot.legend(frameon=False, fontsize=8)

@@ -80,6 +80,12 @@ class Design:
     ----------
     variables, goal
         What varies, and what is wanted.
+    folder
+        Folder of the design, with the evaluations in points/.
+    comm
+        Ranks that compute together.
+    say
+        Called with a line for each evaluation.
     rows
         Rows of design.csv, one per evaluation.
     tried
@@ -113,6 +119,7 @@ class Design:
         # the targets of a stage before the last give other results for the same x
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
+        # files of the evaluation, and of its remanence if that varies
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
         evaluation = on_first_rank(
             self.comm,
@@ -122,7 +129,7 @@ class Design:
         )
         if evaluation is None:
             start_time = time.perf_counter()
-            evaluation = self._evaluated_anew(x, vectors)
+            evaluation = self._computed_evaluation(x, vectors)
             self.seconds.append(time.perf_counter() - start_time)
             content = {**self._identity, "evaluation": asdict(evaluation)}
             on_first_rank(self.comm, lambda: keep(file, content))
@@ -143,7 +150,7 @@ class Design:
         self.goal.targets = targets[stage]
         self.tried.clear()
 
-    def _evaluated_anew(self, x: Array, vectors: Path) -> DesignEvaluation:
+    def _computed_evaluation(self, x: Array, vectors: Path) -> DesignEvaluation:
         """Compute the evaluation of a vector of variables; collective.
 
         Parameters
@@ -194,6 +201,7 @@ class Design:
         }
         self.rows.append(row)
         access_disk(self.comm, self._write)
+        # the line of text: results, a note (in brackets behind results), the time that is left
         values = ", ".join(
             f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items()
         )
@@ -228,8 +236,15 @@ class Design:
         The least violation of the constraints counts first, then the objective.
         """
         solved = [(x, evaluation) for x, evaluation in self.tried if evaluation.values]
-        # of each pair (vector, evaluation) the evaluation counts
-        return min(solved, key=lambda pair: self.goal.merit(pair[1])) if solved else None
+        if not solved:
+            return None
+
+        def merit(x_and_evaluation: tuple[Array, DesignEvaluation]) -> tuple[float, float]:
+            """Return violation and objective of an evaluation; the least pair is the best."""
+            _, evaluation = x_and_evaluation
+            return self.goal.merit(evaluation)
+
+        return min(solved, key=merit)
 
 
 def design(
@@ -307,17 +322,8 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     section = design_goal.section
     first_evaluation, best, x, ended = _optimised(search)
     angle_steps = section.remanence.steps if section.remanence else None
-    if angle_steps:  # angles that can be made: the rounded design is evaluated once more
-        x = vary.rounded(x, angle_steps)
-        unrounded, best = best, search(x)
-        if not best.values:
-            raise Missed(
-                f"with angles in {angle_steps} steps of a turn there is no result: {best.note}"
-            )
-        search.say(
-            f"angles rounded to {angle_steps} steps of a turn: {design_goal.words(unrounded)} -> "
-            f"{design_goal.words(best)}"
-        )
+    if angle_steps:  # angles that can be made
+        x, best = _rounded(search, x, best, angle_steps)
     access_disk(comm, partial(_write_best, search, x, file))
     content: dict[str, Any] = {
         "case": file.name,
@@ -332,8 +338,11 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
         "violation": design_goal.violation(best),
         "sources": code_version(),
     }
-    goal = section.objective
-    target_values = {goal.reach: goal.value} if goal.reach and goal.value is not None else {}
+    # result -> its wanted value, if there is one
+    wanted = section.objective
+    target_values = (
+        {wanted.reach: wanted.value} if wanted.reach and wanted.value is not None else {}
+    )
     draw_result = partial(
         draw_design, search.rows, design_goal.results, vary, x, folder / "design.png", target_values
     )
@@ -341,6 +350,7 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     access_disk(comm, lambda: write_object(folder / "summary.json", content))
     # the summary is written before and after the long run of the verification
     content["verified"] = verified(search, best, comm)
+    # the picture is drawn again, with the shape that the verified run has reached
     targets: Sequence[Callable[[Array], Array] | None] = [*design_goal.targets.values()] or [None]
     for target in targets:
         access_disk(comm, partial(_draw_reached, draw_result, folder / "verified", target))
@@ -348,6 +358,41 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     if missed := design_goal.missed(best):
         raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
     return content
+
+
+def _rounded(
+    search: Design, x: Array, best: DesignEvaluation, angle_steps: int
+) -> tuple[Array, DesignEvaluation]:
+    """Round the angles of the remanence of the best design, and evaluate it once more; collective.
+
+    Parameters
+    ----------
+    x, best
+        Variables (p,) of the best design, and its evaluation.
+    angle_steps
+        Number of steps of a full turn, to which angles are rounded.
+
+    Returns
+    -------
+    x, best
+        The rounded variables (p,), and their evaluation.
+
+    Raises
+    ------
+    Missed
+        If the rounded design has no result.
+    """
+    rounded_x = search.variables.rounded(x, angle_steps)
+    rounded_best = search(rounded_x)
+    if not rounded_best.values:
+        raise Missed(
+            f"with angles in {angle_steps} steps of a turn there is no result: {rounded_best.note}"
+        )
+    search.say(
+        f"angles rounded to {angle_steps} steps of a turn: {search.goal.words(best)} -> "
+        f"{search.goal.words(rounded_best)}"
+    )
+    return rounded_x, rounded_best
 
 
 def _draw_reached(
@@ -383,7 +428,7 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
         If the start has no result, or no variable has an influence.
     """
     vary, goal, iterations = search.variables, search.goal, search.goal.section.iterations
-    targets = [*goal.stages, goal.targets]
+    targets = [*goal.stages, goal.targets]  # one item for each stage
     search.begin(0, targets)
     first, x = search(vary.start_values), vary.start_values
     if not first.values:
@@ -501,20 +546,12 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
         if value is None:
             say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
         elif designed is not None:
-            relative_difference = value / designed - 1
-            say(
-                f"verified ({how}): {name} = {value:.9g}, {_difference_words(relative_difference)} "
-                f"the design's {designed:.9g}"
-            )
-            if abs(relative_difference) > OTHER_RESULT_DIFFERENCE:  # no matter of the mesh's error
-                say(
-                    f"warning: {name} is another one there: the mesh is too coarse, or there are "
-                    "several equilibria"
-                )
+            _say_difference(say, how, name, value, designed)
+    # instabilities of modes that the reduced model of the design does not have
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
     if modes and not any(name in FOLDS for name in goal.results):
         say(f"warning: the run sees modes that the design did not: {', '.join(modes)}")
-    # unstable modes that the reduced model of the design does not have
+    # number of unstable ones among them at the end
     excluded = int(result.rows[-1]["excluded_pivots"]) if result.rows else 0
     return {
         "settings": settings,
@@ -523,6 +560,28 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
         "excluded_modes": modes,
         "excluded_pivots": excluded,
     }
+
+
+def _say_difference(say: Say, how: str, name: str, value: float, designed: float) -> None:
+    """Say a verified result beside that of the design, with a warning if it is another one.
+
+    Parameters
+    ----------
+    how
+        Settings of the verified run, in words.
+    value, designed
+        The result of that run, and of the design.
+    """
+    relative_difference = value / designed - 1
+    say(
+        f"verified ({how}): {name} = {value:.9g}, {_difference_words(relative_difference)} "
+        f"the design's {designed:.9g}"
+    )
+    if abs(relative_difference) > OTHER_RESULT_DIFFERENCE:  # no matter of the mesh's error
+        say(
+            f"warning: {name} is another one there: the mesh is too coarse, or there are "
+            "several equilibria"
+        )
 
 
 def _value(result: Result, name: str) -> float | None:
@@ -545,11 +604,14 @@ def _value(result: Result, name: str) -> float | None:
         return None
     row = result.rows[-1]
     try:
-        # None if the name is no frequency
+        # a frequency; None if the name is none
         omega2 = vibration_at_end(result.scene, result.path_history, name)
     except LostResult:
         return None
-    return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2
+    if omega2 is not None:
+        return omega2
+    # a column of the last point, without unit or in units
+    return float((row | result.scene.sizes.values(row))[name])
 
 
 def _difference_words(relative_difference: float) -> str:

@@ -133,6 +133,8 @@ class Vectors:
         (n, 3), or (n, 2) on a meridian: vectors of the case itself, over |B^r|.
     lengths
         Least and largest length; None: lengths stay as they are.
+    name
+        Name of the block, and of the field in gradients.
     """
 
     controls: ControlPoints
@@ -201,6 +203,7 @@ class Vectors:
         # one row of variables for each kind; lengths are the last one if they vary
         polar, *other_variables = x.reshape(-1, len(self.start))
         s, c = np.sin(polar), np.cos(polar)
+        # lengths (n,), and their derivative by the scaled variables; 0 if they do not vary
         length, length_range = np.linalg.norm(self.start, axis=1), 0.0
         if self.lengths:
             length_range = self.lengths[1] - self.lengths[0]
@@ -215,10 +218,10 @@ class Vectors:
             derivatives = [length_column * by_polar]
         else:
             azimuth = other_variables[0]
-            a, b = np.cos(azimuth), np.sin(azimuth)
-            unit = np.stack([s * a, s * b, c], axis=1)
-            by_polar = np.stack([c * a, c * b, -s], axis=1)
-            by_azimuth = np.stack([-s * b, s * a, 0 * s], axis=1)
+            cos_azimuth, sin_azimuth = np.cos(azimuth), np.sin(azimuth)
+            unit = np.stack([s * cos_azimuth, s * sin_azimuth, c], axis=1)
+            by_polar = np.stack([c * cos_azimuth, c * sin_azimuth, -s], axis=1)
+            by_azimuth = np.stack([-s * sin_azimuth, s * cos_azimuth, 0 * s], axis=1)
             derivatives = [length_column * by_polar, length_column * by_azimuth]
         if self.lengths:
             derivatives.append(length_range * unit)
@@ -298,13 +301,12 @@ class ControlPointField(Bounded):
             # the third component is the twist
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*formulas, 0]}
             return
-        # name -> the shell's section, control points in its frame, and its thickness over h
-        single_shell = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
-        several_shells = {
-            name: (data["shells"][name]["shell"], *self._controls_on_shell(*pose_and_ratio))
-            for name, pose_and_ratio in self.shells.items()
-        }
-        for shell, controls, ratio in (single_shell | several_shells).values():
+        # for each shell its section, control points in its frame, and its thickness over h
+        shells = [] if self.shells else [(data["shell"], self.controls, 1.0)]
+        for name, (pose, ratio_of_shell) in self.shells.items():
+            section = data["shells"][name]["shell"]
+            shells.append((section, self._controls_on_shell(pose), ratio_of_shell))
+        for shell, controls, ratio in shells:
             if self.name == "thickness":
                 shell["thickness_factor"] = self._formula(values[0], controls)
                 continue
@@ -313,19 +315,16 @@ class ControlPointField(Bounded):
             imperfection = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), imperfection]
 
-    def _controls_on_shell(self, place: ShellPose, ratio: float) -> tuple[ControlPoints, float]:
-        """Return the control points in the frame of one of several shells, over its own length.
-
-        The second value is the shell's thickness over h.
-        """
+    def _controls_on_shell(self, pose: ShellPose) -> ControlPoints:
+        """Return the control points in the frame of one of several shells, over its own length."""
         points = self.controls.places
         if self.controls.is_axisymmetric:  # (rho, z) of a meridian: (rho, 0, z) in space
             points = np.insert(points, 1, 0.0, axis=1)
-        points_of_shell = place.to_shell_frame(points)
+        points_of_shell = pose.to_shell_frame(points)
         if self.controls.is_axisymmetric:  # and (rho, z) again
             x, y, z = points_of_shell.T
             points_of_shell = np.column_stack([np.hypot(x, y), z])
-        return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
+        return ControlPoints(points_of_shell, self.controls.width / pose.scale)
 
     def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:
         """Return the thickness over h of each node's shell, (nodes of cells, 1).
@@ -341,11 +340,14 @@ class ControlPointField(Bounded):
         assert surface
         ratios = np.ones(shape)
         for name, (_, ratio) in self.shells.items():
-            ratios[surface.patches[name][: shape[0]]] = ratio
+            cells_of_shell = surface.patches[name][: shape[0]]  # a mask; ghosts are left out
+            ratios[cells_of_shell] = ratio
         return ratios.reshape(-1, 1)
 
     def _formula(self, values: Array, controls: ControlPoints, R: float = 1.0) -> str:
         """Return the formula of the field for values (n,) at the control points.
+
+        It is the mean of the values with the weights exp(-d^2/width^2), at distances d.
 
         Parameters
         ----------

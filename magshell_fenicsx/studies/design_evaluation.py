@@ -117,17 +117,15 @@ def evaluate(
             if result == MASS:
                 _add_mass(evaluation, scene, variables, slope)
                 continue
-            # a critical load may lie before the place where the path is lost
+            # only a critical load may lie before the place where the path is lost
             if path.lost_reason and result not in FOLDS:
                 return DesignEvaluation(note=notes[0])
+            # pairs of the mode and its adjoint, of several modes the lowest first
             adjoints, note = _adjoints(scene, path, result, targets)
             notes += [note] if note else []
-            # value and gradient of each mode
+            # value and gradient (p,) of each mode
             values = [
-                (
-                    adjoint_of_mode.value_in_unit,
-                    slope({name: derivative(adjoint_of_mode, name) for name in variables.names}),
-                )
+                _value_and_gradient(adjoint_of_mode, variables, slope)
                 for _, adjoint_of_mode in adjoints
             ]
             # the lowest is first, and all others stand beside it
@@ -140,6 +138,19 @@ def evaluate(
         _, largest_distance = distances(scene, path.records[-1].point.state, target)
         evaluation.seen[DISTANCE] = largest_distance
     return replace(evaluation, note="; ".join(notes))
+
+
+# converts gradients by names of numbers and fields to the gradient (p,) by the variables
+Slope = Callable[[Mapping[str, float | FieldGradient]], list[float]]
+
+
+def _value_and_gradient(
+    adjoint: Adjoint, variables: Variables, slope: Slope
+) -> tuple[float, list[float]]:
+    """Return a result in its unit, and its gradient (p,) by the variables; collective."""
+    value = adjoint.value_in_unit
+    derivatives = {name: derivative(adjoint, name) for name in variables.names}
+    return value, slope(derivatives)
 
 
 @dataclass
@@ -198,20 +209,18 @@ def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _ComputedPath:
 
 
 def _add_mass(
-    evaluation: DesignEvaluation,
-    scene: Scene,
-    variables: Variables,
-    slope: Callable[[Mapping[str, float | FieldGradient]], list[float]],
+    evaluation: DesignEvaluation, scene: Scene, variables: Variables, slope: Slope
 ) -> None:
     """Add the mass of the shell, with its gradient, to an evaluation.
 
     Parameters
     ----------
     slope
-        Gradient (p,) by the variables from derivatives by names of numbers and fields.
+        Converts derivatives by names of numbers and fields to the gradient (p,) by the variables.
     """
     functional = mass(scene)
-    # fields and numbers of the shell alone change its mass
+    # fields and numbers of the shell alone change its mass; one of thickness h has no forms, and
+    # no derivatives
     keys = [name for name in variables.names if name in WITH_MASS or "shell." in name]
     derivatives = {name: derivative(functional, name) for name in keys if functional.forms}
     evaluation.values[MASS], evaluation.gradients[MASS] = functional.value, slope(derivatives)
@@ -270,11 +279,12 @@ def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:
     Folds of one load need the path up to `MAX_LOAD_RATIO` times the lowest instability. All other
     results need the whole path.
     """
-    # loads of the results; None for one that needs the whole path
+    # loads of the results; None for one that is no critical load, and needs the whole path
     amplitudes = {FOLDS.get(result) for result in results if result != MASS}
     if None in amplitudes or len(amplitudes) > 1:
         return False
     (name,) = amplitudes
     assert name
+    # the load at the lowest instability so far
     lowest = min((load(r, name) for r in located(records, name)), default=np.inf)
     return records[-1].amplitude == name and load(records[-1], name) > MAX_LOAD_RATIO * lowest

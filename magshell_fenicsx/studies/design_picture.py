@@ -115,6 +115,7 @@ def draw_design(
     from matplotlib.figure import Figure
 
     units = dict.fromkeys(map(_unit, results))  # each once, in order: an axis for each
+    # panels of the results, the wanted shape, the remanence and each field
     panels = (
         1
         + (shape is not None and shape.target is not None)
@@ -172,10 +173,8 @@ def _draw_history(
         Result -> the wanted value, a dotted line.
     """
     # numbers of the evaluations, and whether each was the best so far
-    number, best = (
-        np.array([row[key] for row in rows], dtype=kind)
-        for key, kind in (("evaluation", int), ("best", bool))
-    )
+    number = np.array([row["evaluation"] for row in rows], dtype=int)
+    best = np.array([row["best"] for row in rows], dtype=bool)
     axes.xaxis.get_major_locator().set_params(integer=True)
     for i, result in enumerate(results):
         values = np.array(
@@ -202,7 +201,8 @@ def _draw_history(
             axes.set_yscale("log")
     if axes.get_yscale() == "linear":
         axes.yaxis.set_major_formatter(number_format())
-    # the name of a single result is at the axis; of several the legend has the names
+    # the name of a single result is at the axis; of several the legend has the names. A scale that
+    # is no unit, such as "h", is not written
     unit_text = unit if unit in {"Hz", *endings().values()} else ""
     if len(results) == 1:
         axes.set_ylabel(result_words(results[0]) + (f"  ({unit_text})" if unit_text else ""))
@@ -220,8 +220,11 @@ def _common(words: Sequence[str]) -> str:
     >>> _common(["$f_z$ of east", "$f_z$ of west"]), _common(["mass", "knockdown"])
     ('$f_z$', 'results')
     """
-    heads = {word.rpartition(" of ")[0] for word in words}
-    return heads.pop() or "results" if len(heads) == 1 else "results"
+    # what stands before " of "; "" if there is no " of "
+    first_words = {text.rpartition(" of ")[0] for text in words}
+    if len(first_words) != 1:
+        return "results"
+    return first_words.pop() or "results"
 
 
 def _draw_shape(axes: Any, shape: ReachedShape, target_points: Array) -> None:

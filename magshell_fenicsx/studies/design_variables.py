@@ -5,7 +5,8 @@ between their bounds, or angles. A field is given by values at control points: e
 mean, weighted by distance over the filter width. The fields are the remanence (vectors over |B^r|),
 the thickness over h, the natural curvatures 11 and 22 over 1/R, and the deviation w0 of the shape
 over h. On a meridian, where a field turns with the azimuth, points are (rho, z). A scene is the
-model of a case with its solver. Places are over R.
+model of a case with its solver. Places are over R. `case.several` has the shells of a case of
+several ones; it is None for a single shell. lambda_m is the size of the magnetic load.
 """
 
 import copy
@@ -229,28 +230,49 @@ def refuse_unfit_numbers(
         # the number in SI units, and as the case file has it: text with a unit, a bare number, or
         # None where it is a default
         try:
-            value, text = number_at_key(case.context, key), value_at(source.data, key.split("."))
+            si_value = number_at_key(case.context, key)
+            as_written = value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
-        start = value / si_size(unit)
-        if isinstance(text, str):  # check that the case has the unit of the bounds
-            try:
-                value = in_unit(text, unit)
-            except ValueError:
-                message = (
-                    f"design.numbers: {key}: the case gives {text}: its bounds need such a unit"
-                )
-                raise CaseError(message) from None
-        elif unit:
-            raise CaseError(
-                f"design.numbers: {key}: is a number without a unit in the case: so are its bounds"
-            )
+        value = _value_in_unit_of_bounds(key, si_value, as_written, unit)
         if not low <= value <= high:
             raise CaseError(
                 f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}"
             )
-        numbers.append(NumberVariable(key, np.array([start]), (low, high), unit))
+        start = np.array([si_value / si_size(unit)])
+        numbers.append(NumberVariable(key, start, bounds=(low, high), unit=unit))
     return tuple(numbers)
+
+
+def _value_in_unit_of_bounds(key: str, si_value: float, as_written: Any, unit: str) -> float:
+    """Return a number of the case in the unit of its bounds, to compare it with these.
+
+    Parameters
+    ----------
+    si_value, as_written
+        The number in SI units, and as the case file has it: text with a unit, a bare number, or
+        None where it is a default.
+    unit
+        Unit of the bounds; "" without.
+
+    Raises
+    ------
+    CaseError
+        If the case gives another kind of unit, or the bounds have one and the number has none.
+    """
+    if isinstance(as_written, str):
+        try:
+            return in_unit(as_written, unit)
+        except ValueError:
+            message = (
+                f"design.numbers: {key}: the case gives {as_written}: its bounds need such a unit"
+            )
+            raise CaseError(message) from None
+    if unit:
+        raise CaseError(
+            f"design.numbers: {key}: is a number without a unit in the case: so are its bounds"
+        )
+    return si_value
 
 
 def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
@@ -262,7 +284,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
         If a field starts beyond its bounds, or several shells have thickness factors of their own.
     """
     fields, problem, several = [], case.problem(), case.several
-    # name of a shell -> its pose, and its thickness over h
+    # name of one of several shells -> its pose, and its thickness over h
     shells = (
         {part.name: (several.place(part), several.ratio(part)) for part in several.parts}
         if several
@@ -270,24 +292,9 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
     )
     for name, section in design.fields.items():
         places, width = _spread(case, problem, section.points, section.filter)
-        shells_with_factor = (
-            [part.name for part in several.parts if part.case.thickness_factor is not None]
-            if several
-            else []
-        )
-        if name == "thickness" and shells_with_factor:
-            raise CaseError(
-                f"design.thickness: starts even: leave out "
-                f"shells.{shells_with_factor[0]}.shell.thickness_factor"
-            )
-        # values (n, 1) or (n, 2) at the control points at the start
-        start: Array
-        if name == "thickness":  # that of several shells is 1 but for their patches
-            start = (problem.thickness or Thickness()).values_at(places)[:, None]
-        elif name == "curvature":
-            start = _curvatures(problem, places)
-        else:
-            start = np.zeros((len(places), 1))
+        if name == "thickness":
+            _refuse_thickness_factors(case)
+        start = _start_of_field(name, problem, places)
         low, high = section.values
         if not (low <= start.min() and start.max() <= high):
             raise CaseError(
@@ -300,13 +307,48 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
             ControlPointField(
                 name,
                 np.asarray(start),
-                (low, high),
-                ControlPoints(points, width),
-                case.shell.reference,
-                shells,
+                bounds=(low, high),
+                controls=ControlPoints(points, width),
+                length=case.shell.reference,
+                shells=shells,
             )
         )
     return tuple(fields)
+
+
+def _refuse_thickness_factors(case: Case) -> None:
+    """Check that no one of several shells has a thickness factor of its own.
+
+    Raises
+    ------
+    CaseError
+        With the first shell that has one.
+    """
+    if not case.several:
+        return
+    shells_with_factor = [
+        part.name for part in case.several.parts if part.case.thickness_factor is not None
+    ]
+    if shells_with_factor:
+        raise CaseError(
+            f"design.thickness: starts even: leave out "
+            f"shells.{shells_with_factor[0]}.shell.thickness_factor"
+        )
+
+
+def _start_of_field(name: str, problem: Problem, places: Array) -> Array:
+    """Return the values (n, 1 or 2) of a field in the case itself, at places (n, 3).
+
+    Raises
+    ------
+    CaseError
+        If the natural curvature is given by patches or as a user's field.
+    """
+    if name == "thickness":  # that of several shells is 1 but for their patches
+        return np.asarray((problem.thickness or Thickness()).values_at(places)[:, None])
+    if name == "curvature":
+        return _curvatures(problem, places)
+    return np.zeros((len(places), 1))  # a deviation is added to the shape
 
 
 def _curvatures(problem: Problem, places: Array) -> Array:
@@ -331,10 +373,12 @@ def _curvatures(problem: Problem, places: Array) -> Array:
 
 
 def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tuple[Array, float]:
-    """Return control points (n, 3) on the surface, and the filter width.
+    """Return control points (n, 3) spread over the surface, and the filter width.
 
     Parameters
     ----------
+    count
+        Number of points.
     width
         Filter width over R; None: the median distance of neighbouring points.
     """
@@ -403,7 +447,7 @@ def controls_of(
             "so no result "
             "depends on it"
         )
-    if count is None:  # a remanence of kind `points` has its own
+    if count is None:  # a remanence of kind `points` has its own points
         if not (magnetic.remanent and magnetic.remanent.file):
             raise CaseError(f"{key}: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(
@@ -413,7 +457,29 @@ def controls_of(
     # points spread over the surface, with the remanence of the case there
     problem = case.problem()
     places, width = _spread(case, problem, count, width)
-    field = magnetisation(magnetic, case.context, 0.0, problem.within)
+    vectors = _remanence_at(places, count, case, problem, key)
+    if problem.meridian:  # (rho, z)
+        places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
+    return ControlPoints(places, width), vectors
+
+
+def _remanence_at(places: Array, count: int, case: Case, problem: Problem, key: str) -> Array:
+    """Return the remanence (n, 3) of a case over |B^r|, at places (n, 3).
+
+    Parameters
+    ----------
+    count
+        Number n of vectors if all are the same.
+    key
+        Key with which messages begin.
+
+    Raises
+    ------
+    CaseError
+        If the remanence is given by patches of a mesh.
+    """
+    # the magnetisation in the frame of the case, turned by no angle
+    field = magnetisation(case.magnetic, case.context, turn=0.0, patch_rims=problem.within)
     if field.patches is not None:
         raise CaseError(
             f"{key}.points: the remanence starts by patches of a mesh: start from another kind"
@@ -422,16 +488,15 @@ def controls_of(
         # outward directions of the points from the origin
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
         # a function of places and normals (cells, nodes, 3)
-        vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
-    else:
-        vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
-    if problem.meridian:
-        places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
-    return ControlPoints(places, width), vectors
+        return np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
+    return np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
 
 
 def _places(case: Case, problem: Problem, count: int) -> Array:
-    """Return points (n, 3) along a meridian or a strip, or far from each other on the surface."""
+    """Return `count` points (n, 3) along a meridian or a strip, or all over the surface.
+
+    On a surface they are far from each other; a coarse sample of it may have fewer points.
+    """
     if problem.meridian:
         sample = problem.meridian.sample()
         chosen = np.linspace(0, len(sample) - 1, count).round().astype(int)

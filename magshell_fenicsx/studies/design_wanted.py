@@ -36,7 +36,7 @@ CONSTRAINT_TOLERANCE = 1e-6  # a constraint counts as kept to this part of its b
 TARGET_TOLERANCE = 1e-3  # a value counts as reached to this part of it
 WORSE = 1.0  # a lost path counts as this much worse than the worst known
 SPLINE_POINTS = 4001  # points by which the length of a spline is measured
-AT_ROOT = 1e-6
+AT_ROOT = 1e-6  # distance of a curve's first point from the strip's root
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class DesignGoal:
         objective = self.section.objective
         # of several results, which are maximised, the lowest counts
         value = min(evaluation.values[result] for result in objective.results)
-        scale = self._scale or abs(value) or 1.0
+        scale = self._objective_scale or abs(value) or 1.0
         if objective.value is not None:
             scale = abs(objective.value) or scale
             difference = value - objective.value
@@ -276,7 +276,7 @@ class DesignGoal:
         return sign * value / scale, sign / scale
 
     @property
-    def _scale(self) -> float:
+    def _objective_scale(self) -> float:
         """Largest absolute value of the objective's results at the start; 0 if unknown."""
         return max(
             (self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0
@@ -304,6 +304,7 @@ class DesignGoal:
         They are the objective's results, each with the instabilities or frequencies next to it.
         Their number is constant: missing ones are replaced by an upper bound.
         """
+        # for each result its value and those next to it, without gradients
         groups = [
             _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
             for result in self.section.objective.results
@@ -312,12 +313,13 @@ class DesignGoal:
             np.concatenate(
                 [[value for value, _ in values_and_slopes] for values_and_slopes in groups]
             )
-            / self._scale
+            / self._objective_scale
         )
 
     def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
         """Return the gradients (n, p) of `lowest_values`, in the same order."""
         results = self.section.objective.results
+        # for each result the pairs of value and gradient, of it and of those next to it
         groups = [
             _value_and_close_ones(
                 evaluation.values[result],
@@ -330,19 +332,19 @@ class DesignGoal:
             np.concatenate(
                 [[slope for _, slope in values_and_slopes] for values_and_slopes in groups]
             )
-            / self._scale
+            / self._objective_scale
         )
 
     def constraints(self, evaluation: DesignEvaluation) -> Array:
         """Return the scaled slacks of the constraints; negative where one is violated."""
         return np.array(
-            [limit.slack(evaluation.values) / self._size(limit) for limit in self._limits]
+            [limit.slack(evaluation.values) / self._slack_scale(limit) for limit in self._limits]
         )
 
     def constraint_slopes(self, evaluation: DesignEvaluation) -> Array:
         """Return the gradients (constraints, variables) of `constraints`."""
         return np.array(
-            [limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits]
+            [limit.slope(evaluation.gradients) / self._slack_scale(limit) for limit in self._limits]
         )
 
     @property
@@ -354,7 +356,7 @@ class DesignGoal:
             for limit in limits_of(section, self.scale)
         ]
 
-    def _size(self, limit: Limit) -> float:
+    def _slack_scale(self, limit: Limit) -> float:
         """Return the scale of a constraint's slack.
 
         It is the absolute bound; without a bound, or with the bound zero, the larger of the two
@@ -396,7 +398,7 @@ class DesignGoal:
                 sentences.append(f"{request}: the nearest found is {value:.6g}")
         for limit in self._limits:
             # the margin of an equality is in its slack
-            if limit.slack(evaluation.values) < -CONSTRAINT_TOLERANCE * self._size(limit):
+            if limit.slack(evaluation.values) < -CONSTRAINT_TOLERANCE * self._slack_scale(limit):
                 sentences.append(
                     f"{limit.words} is not kept: the nearest found is "
                     f"{evaluation.values[limit.of]:.6g}"
@@ -465,14 +467,33 @@ def search_optimum(
         return raise_lowest(evaluated, goal, vary.limits, first, iterations)
     if goal.lowest:  # several smooth results
         return _raise_lowest_smooth(evaluated, goal, vary, first, iterations)
-    # one smooth result; variables and objective of all evaluations with values
+    return _improve_smooth(evaluated, goal, vary, first, iterations)
+
+
+def _improve_smooth(
+    evaluated: Callable[[Array], DesignEvaluation],
+    goal: DesignGoal,
+    vary: Variables,
+    first: Array,
+    iterations: int,
+) -> str:
+    """Minimise the objective of one smooth result; return the optimiser's message about its end.
+
+    Parameters
+    ----------
+    evaluated
+        Evaluates variables (p,); it has no values if the path is lost.
+    first
+        Variables (p,) at the start.
+    """
+    # variables and objective of all evaluations with values
     tried: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
         """Return the objective and its gradient (p,)."""
         evaluation = evaluated(x)
         if not evaluation.values:
-            # a lost path counts as worse than all, uphill from the best point
+            # where the path is lost, the objective is worse than all, and rises from the best point
             best_x, _ = min(tried, key=lambda evaluated_point: evaluated_point[1])
             direction = x - best_x
             uphill = np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
@@ -482,15 +503,17 @@ def search_optimum(
         return value, goal.slope(evaluation)
 
     def constraint_values(x: Array) -> Array:
+        """Return the slacks of the constraints; where the path is lost, the last known ones."""
         evaluation, _ = evaluate_or_last(x)
         return goal.constraints(evaluation)
 
     def constraint_gradients(x: Array) -> Array:
+        """Return the gradients (constraints, p) of `constraint_values`."""
         evaluation, _ = evaluate_or_last(x)
         return goal.constraint_slopes(evaluation)
 
     evaluate_or_last, method_options = _last_known(evaluated), dict[str, Any]()
-    # L-BFGS-B is better without constraints, but takes only bounds
+    # without constraints L-BFGS-B is better, but it takes only bounds
     if goal.section.constraints:
         method_options = {
             "method": "SLSQP",

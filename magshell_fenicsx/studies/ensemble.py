@@ -12,7 +12,7 @@ with its solver; a record is a point of its path. A part is what one of several 
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -183,15 +183,8 @@ def ensemble(  # noqa: PLR0913 - what a user gives
         sample = samples_by_key[key]
         outcome = solve(sample, scalar, folds)
         keep_outcome(outcome, sample.case, _file(folder, key))
-        value = outcome.value(scalar)
-        outcome_text = (
-            f"no {scalar.name}"
-            if value is None
-            else f"{scalar.name} = {value:.9g} ({outcome.found})"
-        )
-        reason = f", {outcome.stopped}" if outcome.stopped else ""
         place = f"{missing.index(key) + 1:5d}/{len(missing)}"
-        yield f"{place}  sample {sample.number}: {outcome_text}{reason}, {outcome.cpu_s:.1f} s CPU"
+        yield f"{place}  sample {sample.number}: {_words(outcome, scalar)}"
 
     compute(missing, sample_computed, comm, say)
     rows = [
@@ -210,6 +203,16 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     }
     access_disk(comm, lambda: _write(rows, content, folder, ending))
     return Ensemble(rows, content)
+
+
+def _words(outcome: Outcome, scalar: Scalar) -> str:
+    """Return the outcome of a sample in words: the number, why it ended early, and the CPU time."""
+    value = outcome.value(scalar)
+    outcome_text = (
+        f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
+    )
+    reason = f", {outcome.stopped}" if outcome.stopped else ""
+    return f"{outcome_text}{reason}, {outcome.cpu_s:.1f} s CPU"
 
 
 def _numbers(samples: int, seed: int, part: str | None) -> range:
@@ -234,7 +237,7 @@ def _file(folder: Path, key: str) -> Path:
 
 
 def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
-    """Return whether the folder has a usable outcome of a sample.
+    """Return whether the folder has an outcome of a sample with the wanted number.
 
     An outcome with an error is not usable: the error may have been one of the machine.
     """
@@ -244,7 +247,7 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
     )
 
 
-def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge: bool) -> None:
+def _refuse_strange(folders: Sequence[Path], keys: Iterable[str], *, merge: bool) -> None:
     """Check that folders have samples of this ensemble.
 
     An ensemble that was killed before its first sample may begin again.
@@ -252,7 +255,7 @@ def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge
     Parameters
     ----------
     keys
-        Key of a sample -> the sample.
+        Keys of the samples of this ensemble.
     merge
         Whether the folders are parts to be merged.
 
@@ -261,21 +264,36 @@ def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge
     CaseError
         If a folder has none of the samples.
     """
-    for place in places:
-        points = place / "points"
-        interrupted = not merge and points.is_dir() and not any(points.glob("*.json"))
-        if not interrupted and not any(stored_outcome_of_case(_file(place, key)) for key in keys):
+    for folder in folders:
+        points = folder / "points"
+        # killed before its first sample
+        has_no_sample_yet = not merge and points.is_dir() and not any(points.glob("*.json"))
+        if not has_no_sample_yet and not any(
+            stored_outcome_of_case(_file(folder, key)) for key in keys
+        ):
             raise CaseError(
-                f"{place}: has no sample of this ensemble that these sources computed: look at "
+                f"{folder}: has no sample of this ensemble that these sources computed: look at "
                 "case, --seed and --set"
             )
 
 
-def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> None:
-    """Copy the outcomes of samples from the folders of parts into a folder; called on rank 0."""
+def _copy(keys: Iterable[str], part_folders: Sequence[Path], folder: Path) -> None:
+    """Copy the outcomes of samples from the folders of parts into a folder; called on rank 0.
+
+    Parameters
+    ----------
+    keys
+        Keys of the samples.
+    """
     for key in keys:
+        # the first part that has a usable outcome
         source_file = next(
-            (file for place in places if stored_outcome_of_case(file := _file(place, key))), None
+            (
+                file
+                for part_folder in part_folders
+                if stored_outcome_of_case(file := _file(part_folder, key))
+            ),
+            None,
         )
         # one of the parts may be in the folder itself
         if source_file and source_file.resolve() != _file(folder, key).resolve():
@@ -334,10 +352,17 @@ def solve(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
 
 
 def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
-    """Compute a sample.
+    """Compute a sample; its errors are those of the run.
 
     A knockdown is found from the fold of an earlier sample. If that fails, the path is followed, as
     for every other result.
+
+    Parameters
+    ----------
+    scalar
+        The wanted number.
+    folds
+        Folds of earlier samples on this rank.
     """
     # imperfections may be modes of the perfect shell, which are computed first
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
@@ -345,12 +370,13 @@ def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
         return _outcome(run(problem, comm=MPI.COMM_SELF))
     scene = Scene(problem, MPI.COMM_SELF)
     try:
-        return _of_fold(scene, folds.follow(sample.values, scene))
+        # from the nearest known fold on the same mesh
+        return _outcome_of_fold(scene, folds.follow(sample.values, scene))
     except FoldLost:
-        return _along_path(sample, scene, folds)
+        return _outcome_along_path(sample, scene, folds)
 
 
-def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
+def _outcome_along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     """Follow the path of a sample to its fold, or to the end.
 
     The fold is tried from the first points of the path that lead to it. So the rest of the path
@@ -359,7 +385,7 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     result, row_maker, tries_left = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
-            result.rows.append(row_maker.row(record, 0.0))
+            result.rows.append(row_maker.row(record, wall_s=0.0))
             # points of the pressure's path alone lead to its fold
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue
@@ -378,17 +404,17 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
                 continue
             # a fold that was found from a stable point must lie ahead on this path
             if record.label == "fold" or fold.value > point.state.mu["pressure"]:
-                return _of_fold(scene, fold)
+                return _outcome_of_fold(scene, fold)
     except Stopped as e:
         result.stopped = str(e)
     return _outcome(result)
 
 
-def _of_fold(scene: Scene, fold: Fold) -> Outcome:
+def _outcome_of_fold(scene: Scene, fold: Fold) -> Outcome:
     """Return the outcome of a fold that was found without its whole path."""
-    return outcome_of(
-        Result(scene, fold.state, [fold_row(scene, fold)]), "fold", scene.newton.factorisation.count
-    )
+    # in the form of a run whose path has this point alone
+    result = Result(scene, fold.state, [fold_row(scene, fold)])
+    return outcome_of(result, "fold", scene.newton.factorisation.count)
 
 
 def _outcome(result: Result) -> Outcome:

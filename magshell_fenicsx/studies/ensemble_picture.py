@@ -43,6 +43,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     from matplotlib.figure import Figure
 
     values, label = results(rows), KNOCKDOWN if name == "knockdown" else name
+    # column with the strongest correlation, and its correlations; None if there is none
     strongest = max(
         correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None
     )
@@ -61,7 +62,8 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
         _draw_function(function, values, results(rows, WITHOUT), weibull)
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
     if strongest:
-        _draw_correlation(further_axes[0], rows, strongest[0], label)
+        key, _ = strongest
+        _draw_correlation(further_axes[0], rows, key, label)
     for axes in figure.axes:
         axes.locator_params(axis="x", nbins=5)  # long numbers would touch
     figure.savefig(file)
@@ -152,7 +154,7 @@ def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> N
     )
     rho, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
-    # of so strong a correlation by chance
+    # the probability of so strong a correlation by chance
     probability_text = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
     number = f"{rho:.2f}".replace("-", "−")
     axes.set(xlabel=words(key), ylabel=label)
@@ -181,6 +183,7 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     ranks, other_ranks = (rankdata(sample) - (len(x) + 1) / 2 for sample in (x, y))
 
     def rank_product(values: Array, axis: int = -1) -> Array:
+        """Return the sum of products of permuted ranks with the other ranks."""
         return np.asarray(np.sum(values * other_ranks, axis=axis))
 
     test = permutation_test(
@@ -190,7 +193,7 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
 
 
 def words(key: str) -> str:
-    """Return the label of a column of samples.csv, with its unit.
+    """Return the label of a column of samples.csv, the last word of its key with the unit.
 
     Examples
     --------

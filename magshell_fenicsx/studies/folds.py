@@ -69,10 +69,11 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         If its null vector is another, it is no maximum, or the shell is unstable there in another
         direction.
     """
-    comm, fold_mode, mode = scene.newton.system.comm, fold.phi, reference_mode
+    comm, mode = scene.newton.system.comm, fold.phi
     # the cosine of the angle between both null vectors must be large
-    product = dot(comm, fold_mode, mode)
-    if product < LEAST_COSINE * np.sqrt(dot(comm, fold_mode, fold_mode) * dot(comm, mode, mode)):
+    product = dot(comm, mode, reference_mode)
+    squared_lengths = dot(comm, mode, mode) * dot(comm, reference_mode, reference_mode)
+    if product < LEAST_COSINE * np.sqrt(squared_lengths):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
@@ -81,8 +82,8 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         raise FoldLost("another instability comes before the fold")
 
 
-def _held_amplitudes(scene: Scene) -> dict[str, float]:
-    """Return name -> value of the amplitudes that stay while the pressure grows.
+def _constant_amplitudes(scene: Scene) -> dict[str, float]:
+    """Return name -> value of the amplitudes that are constant while the pressure grows.
 
     The magnetic field has its full strength by then; others are as in the unloaded state.
     """
@@ -98,7 +99,7 @@ class Continuation:
     Attributes
     ----------
     _known
-        The last folds with their parameters, (p, fold), in the unknowns of the last scene.
+        Pairs (p, fold) of the last folds with their parameters, in the unknowns of the last scene.
     _scene
         The last scene.
 
@@ -131,9 +132,9 @@ class Continuation:
         FoldLost
             If none is found, or if there is evidence that it is not the first instability.
         """
-        # known folds in the unknowns of the new scene; they predict the fold at p
+        # pairs (parameter, known fold) in the unknowns of the new scene; they predict the fold at p
         transferred = [(q, self._transferred(fold, scene)) for q, fold in self._known]
-        guess = predict_fold(scene.newton.system, transferred, p, _held_amplitudes(scene))
+        guess = predict_fold(scene.newton.system, transferred, p, _constant_amplitudes(scene))
         fold = find_fold(scene.newton, guess, "pressure")
         _, last_fold = transferred[-1]
         refuse_later(scene, fold, last_fold.phi)
@@ -217,6 +218,7 @@ class KnownFolds:
             If none is found, or it is not seen to be the first instability.
         """
         fold = find_fold(scene.newton, guess, "pressure")
+        # it must be the first instability, and resemble the reference; without one, itself
         refuse_later(scene, fold, fold.phi if reference_mode is None else reference_mode)
         stored_fold = _StoredFold(
             values=values,
@@ -244,7 +246,7 @@ class KnownFolds:
             If no known fold is on this mesh, none is found from the nearest one, or it is not seen
             to be the first instability.
         """
-        amplitudes = _held_amplitudes(scene)
+        amplitudes = _constant_amplitudes(scene)
         if amplitudes.keys() - {"pressure", "lambda_m"}:
             raise FoldLost("other amplitudes are driven before the pressure")
         nodes = chart(scene)
@@ -285,8 +287,8 @@ class KnownFolds:
                 return np.inf
             known_numbers = [
                 v
-                for located in self._known
-                if isinstance(v := located.values.get(key), float | int)
+                for known_fold in self._known
+                if isinstance(v := known_fold.values.get(key), float | int)
             ]
             # the difference over the standard deviation, which is 1 if all values are the same
             deviation = float(np.std([*known_numbers, value_a])) or 1.0
@@ -302,7 +304,8 @@ class Scenes:
     Attributes
     ----------
     _kept
-        Key of a scene, see `_apart_from_strength` -> the scene; the one used last stands last.
+        Text of all that determines a scene but the strength of its field -> the scene; the one used
+        last stands last.
     """
 
     def __init__(self) -> None:
@@ -326,8 +329,7 @@ class Scenes:
         self._kept[key] = scene
         # the scenes that were used longest ago are dropped first
         while (
-            sum(scene_in_use.newton.system.size for scene_in_use in self._kept.values())
-            > MOST_UNKNOWNS
+            sum(kept_scene.newton.system.size for kept_scene in self._kept.values()) > MOST_UNKNOWNS
             and len(self._kept) > 1
         ):
             self._kept.pop(next(iter(self._kept)))
@@ -335,18 +337,21 @@ class Scenes:
 
 
 def _apart_from_strength(case: Case) -> str:
-    """Return a key of all that determines a scene but the size of lambda_m.
+    """Return a text of all that determines a scene but the size of lambda_m.
 
-    That size is a load amplitude, which a scene can change.
+    That size is a load amplitude, which a scene can change. Flux densities that change nothing else
+    are left out.
     """
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
-        # with both, the ratio of remanence and susceptibility counts
+        # with both, the ratio of remanence and susceptibility counts: the flux density of the
+        # remanence stays
         has_both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
         magnetic.pop("lambda_m", None)
         if magnetic["remanent"] and not has_both:
             magnetic["remanent"].pop("flux_density", None)
-        # with magnets or coils as sources, it is the flux density of a field beside them
+        # with magnets or coils as sources, the applied flux density is that of a further field
+        # beside theirs, and stays
         if not case.sources:
             magnetic["applied"].pop("flux_density", None)
     return json.dumps([data, bool(case.lambda_m)], sort_keys=True)

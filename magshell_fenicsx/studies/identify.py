@@ -163,15 +163,15 @@ def identify(
                 [item.key for item in parameters]
             )
             predictor = Predictor(
-                extended_source,
-                make_case,
-                parameters,
-                dict(table.readings),
-                folder,
-                mark,
-                comm,
-                field,
-                table.rows,
+                source=extended_source,
+                make_case=make_case,
+                parameters=parameters,
+                readings=dict(table.readings),
+                folder=folder,
+                mark=mark,
+                comm=comm,
+                field=field,
+                rows=table.rows,
             )
             identified, draw_result = _fit_and_predict(
                 predictor, section, table, candidates, say_on_first_rank, flux_density(case)
@@ -204,15 +204,18 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
         If data are fewer than parameters without a prior, or too few to estimate their noise; or if
         a parameter is a key in the data.
     """
-    bare = [parameter.key for parameter in parameters if np.isinf(parameter.deviation)]
-    if len(table.data) < len(bare):
+    # parameters without a prior must be determined by the data alone
+    keys_without_prior = [p.key for p in parameters if np.isinf(p.deviation)]
+    needed_count = len(keys_without_prior)
+    if len(table.data) < needed_count:
         raise CaseError(
-            f"identify.parameters: {len(table.data)} data do not determine {len(bare)} parameters "
-            "without a prior "
-            f"({', '.join(bare)}): give prior and deviation of {len(bare) - len(table.data)} of "
+            f"identify.parameters: {len(table.data)} data do not determine {needed_count} "
+            "parameters without a prior "
+            f"({', '.join(keys_without_prior)}): give prior and deviation of "
+            f"{needed_count - len(table.data)} of "
             "them, or more data"
         )
-    # a key that a column of the data gives is known
+    # a key that a column of the data gives is known: it cannot be a parameter
     keys = {setting.partition("=")[0] for settings in table.readings for setting in settings}
     if parameter_in_data := next(
         (parameter.key for parameter in parameters if parameter.key in keys), None
@@ -223,8 +226,8 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
     for number, column in enumerate(table.columns):
         count = int((table.column == number).sum())
         # residuals must be more than parameters for a noise to be estimated
-        if np.isnan(column.noise) and count <= len(bare):
-            raise _no_noise(table, number, len(bare))
+        if np.isnan(column.noise) and count <= needed_count:
+            raise _noise_error(table, number, parameter_count=needed_count)
 
 
 def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: MakeCase) -> None:
@@ -244,19 +247,19 @@ def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: M
             raise CaseError(f"identify.parameters.{parameter.key}.prior: {e}") from None
 
 
-def _no_noise(table: MeasuredTable, column: int, parameters: int) -> CaseError:
+def _noise_error(table: MeasuredTable, column: int, parameter_count: int) -> CaseError:
     """Return the error that the noise of a column cannot be estimated.
 
     Parameters
     ----------
     column
         Index of the column in the table.
-    parameters
-        Number of parameters.
+    parameter_count
+        Number of parameters that these data determine.
     """
     header, count = table.columns[column].header, int((table.column == column).sum())
     return CaseError(
-        f"identify.noise: {header}: {count} data do not say the noise beside {parameters} "
+        f"identify.noise: {header}: {count} data do not say the noise beside {parameter_count} "
         "parameters: give it"
     )
 
@@ -265,7 +268,7 @@ def _fit_and_predict(
     predictor: Predictor,
     section: IdentifySection,
     table: MeasuredTable,
-    others: Sequence[tuple[Reading, str, float]],
+    candidates: Sequence[tuple[Reading, str, float]],
     say: Say,
     flux_scale: tuple[float, str],
 ) -> tuple[Identified, Callable[[Path], None]]:
@@ -275,8 +278,8 @@ def _fit_and_predict(
     ----------
     predictor
         Predicts the readings of the data for a vector of parameters.
-    others
-        Candidates: reading, its unit, and the standard deviation of such a measurement.
+    candidates
+        For each candidate its reading, its unit, and the standard deviation of such a measurement.
     flux_scale
         |B^r| and its unit, in which a remanence field is reported.
 
@@ -295,20 +298,7 @@ def _fit_and_predict(
         If the path of the case is lost at the start.
     """
     parameters, field = predictor.parameters, predictor.field
-    field_start = field.start_values if field else np.zeros(0)
-    start = np.array([*(parameter.start for parameter in parameters), *field_start])
-    mean = np.array([*(parameter.mean for parameter in parameters), *field_start])
-    deviation = np.array(
-        [*(parameter.deviation for parameter in parameters), *np.full(field_start.size, np.inf)]
-    )
-    noise = np.array([column.noise for column in table.columns])
-    measured = Measured(
-        table.data, table.column, noise, mean, deviation, field.smooth if field else None
-    )
-    finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
-    # scale of each parameter, for well-conditioned steps: deviation of its prior, else its start
-    size = np.where(finite > 0, finite, 1.0)
-    size[len(parameters) :] = 1.0  # numbers of a field are over |B^r|
+    measured, start, size = _data_and_scales(predictor, table)
     first = predictor(start)
     if first.note:  # nothing is predicted
         raise (CaseError if first.invalid else Stopped)(
@@ -340,14 +330,14 @@ def _fit_and_predict(
             "data: give one of them a prior"
         ) from None
     except NoNoise as e:
-        raise _no_noise(table, e.column, len(parameters)) from None
+        raise _noise_error(table, e.column, parameter_count=len(parameters)) from None
     # is the posterior normal? this takes values alone
     misfit_difference, lost_count = nonlinearity(partial(model, slopes=False), posterior)
     content = _content(predictor, table, posterior)
     content["remanence"] = field.summary(posterior, flux_scale) if field else None
     content["normal"] = {"difference": misfit_difference, "lost": lost_count, "within": NORMAL}
     content["predicted"], content["next"] = _predict_candidates(
-        predictor, section, posterior, others
+        predictor, section, posterior, candidates
     )
     content["evaluations"] = predictor.count
     content["programmes"] = {}
@@ -356,8 +346,39 @@ def _fit_and_predict(
     return Identified(content, posterior), draw_result
 
 
+def _data_and_scales(predictor: Predictor, table: MeasuredTable) -> tuple[Measured, Array, Array]:
+    """Return the data with the priors, and the start and the scale of each parameter.
+
+    Returns
+    -------
+    measured
+        Data, noise and priors; nan for noise that is to be estimated.
+    start
+        (p,) parameters of the case itself, then the numbers of a field.
+    size
+        (p,) scales, for well-conditioned steps: the deviation of the prior, without one the size of
+        the start.
+    """
+    parameters, field = predictor.parameters, predictor.field
+    field_start = field.start_values if field else np.zeros(0)
+    start = np.array([*(parameter.start for parameter in parameters), *field_start])
+    mean = np.array([*(parameter.mean for parameter in parameters), *field_start])
+    deviation = np.array(
+        [*(parameter.deviation for parameter in parameters), *np.full(field_start.size, np.inf)]
+    )
+    noise = np.array([column.noise for column in table.columns])
+    measured = Measured(
+        table.data, table.column, noise, mean, deviation, field.smooth if field else None
+    )
+    finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
+    size = np.where(finite > 0, finite, 1.0)
+    size[len(parameters) :] = 1.0  # numbers of a field are over |B^r|
+    return measured, start, size
+
+
 def _parameters_text(parameters: Sequence[Parameter], x: Array) -> str:
     """Return a vector of parameters as text; of a field its root mean square."""
+    # the keys come first, and may be followed by the numbers of a field
     texts = [
         f"{short_key(p.key)} = {v:.6g} {p.unit}".rstrip()
         for p, v in zip(parameters, x, strict=False)
@@ -401,6 +422,7 @@ def _refuse_idle(
 def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -> dict[str, Any]:
     """Return the identified parameters, noise and predictions, as in identify.json."""
     measured, noise_of_data = posterior.measured, posterior.noise[table.column]
+    # header of a column -> its noise; the freedom of given noise is infinite, which JSON has not
     noise = {
         column.header: {
             "deviation": float(posterior.noise[i]),
@@ -484,14 +506,16 @@ def _predict_candidates(
     predictor: Predictor,
     section: IdentifySection,
     posterior: Posterior,
-    others: Sequence[tuple[Reading, str, float]],
+    candidates: Sequence[tuple[Reading, str, float]],
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
     """Predict the candidates, and choose the next measurement; collective.
 
     Parameters
     ----------
-    others
-        Candidates: reading, its unit, and the standard deviation of such a measurement.
+    section
+        Its `narrow` may name the parameter whose deviation the next measurement is to narrow.
+    candidates
+        For each candidate its reading, its unit, and the standard deviation of such a measurement.
 
     Returns
     -------
@@ -501,9 +525,10 @@ def _predict_candidates(
     next
         The candidate that narrows a parameter most, and by how much; None without predicted ones.
     """
-    if not others:
+    if not candidates:
         return [], None
     keys = [parameter.key for parameter in predictor.parameters]
+    # of each parameter; the field, if any, has one for all its numbers
     deviations = _deviations_by_key(keys, posterior.deviation)
     # by default narrow the parameter with the largest relative deviation
     size = np.where(posterior.x != 0, np.abs(posterior.x), 1.0)
@@ -513,11 +538,12 @@ def _predict_candidates(
     )
     rows = [
         _row_of_candidate(predictor, posterior, reading, unit, noise)
-        for reading, unit, noise in others
+        for reading, unit, noise in candidates
     ]
     predicted_rows = [predicted for predicted in rows if "value" in predicted]
     if not predicted_rows:
         return rows, None
+    # the candidate after whose measurement this parameter has the least deviation
     best = min(predicted_rows, key=lambda predicted: predicted["deviations_then"][narrowed_key])
     narrowing = {
         "parameter": narrowed_key,
@@ -539,15 +565,16 @@ def _row_of_candidate(
     reading, unit, noise
         The candidate, its unit, and the standard deviation of such a measurement.
     """
+    # predicts this reading alone, of the case itself: without settings
     candidate_predictor = Predictor(
-        predictor.source,
-        predictor.make_case,
-        predictor.parameters,
-        {(): [reading]},  # of the case itself, without settings
-        predictor.folder,
-        predictor.mark,
-        predictor.comm,
-        predictor.field,
+        source=predictor.source,
+        make_case=predictor.make_case,
+        parameters=predictor.parameters,
+        readings={(): [reading]},
+        folder=predictor.folder,
+        mark=predictor.mark,
+        comm=predictor.comm,
+        field=predictor.field,
     )
     prediction = candidate_predictor(posterior.x)
     predictor.count += candidate_predictor.count
@@ -578,9 +605,9 @@ def _deviations_by_key(keys: Sequence[str], deviations: Array) -> dict[str, floa
     Parameters
     ----------
     keys
-        Keys of the parameters, which stand before the field.
+        Keys of the parameters, which stand before the numbers of the field.
     deviations
-        (p,) standard deviations.
+        (p,) standard deviations; more than keys if there is a field.
     """
     field_deviations = deviations[len(keys) :]
     field_deviation = (
@@ -592,7 +619,10 @@ def _deviations_by_key(keys: Sequence[str], deviations: Array) -> dict[str, floa
 def _curves(
     predictor: Predictor, table: MeasuredTable, posterior: Posterior
 ) -> dict[str, list[tuple[float, float]]]:
-    """Return result -> places and values along the path at the fit, up to the last datum."""
+    """Return result -> places and values along the path at the fit, up to the last datum.
+
+    Collective.
+    """
     prediction, curves = predictor(posterior.x), dict[str, list[tuple[float, float]]]()
     for result, curve in prediction.curves.items():
         if result.startswith(OF_POINTS):

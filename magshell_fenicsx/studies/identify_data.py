@@ -57,8 +57,8 @@ class Parameter:
     number
         Key, unit and value at the start.
     mean, deviation
-        Mean and standard deviation of the prior, in the unit of the number; without a prior the
-        deviation is infinite.
+        Mean and standard deviation of the prior, in the unit of the number. Without a prior the
+        mean is the value at the start, and the deviation is infinite.
     """
 
     number: NumberVariable
@@ -145,6 +145,8 @@ class ResultNames:
         A scene without mesh, which knows names and units alone.
     places
         The load or displacement of the last step; None if there is none.
+
+    `_dimensionless_names` are the names of all results without a unit.
     """
 
     def __init__(self, case: Case) -> None:
@@ -179,14 +181,7 @@ class ResultNames:
         CaseError
             If there is no such result, or a unit is missing or of another dimension.
         """
-        scene = self.scene
-        # name of a result in units of the case -> (its dimensionless name, its unit)
-        units_by_result = {
-            q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))
-        }
-        units_by_result |= {
-            result_name: (result_name, result_name.rpartition("_")[2]) for result_name in SCALES
-        } | {"hertz_1": ("hertz_1", "Hz")}
+        units_by_result = self._units_by_result()
         if unit is None:
             self._refuse_missing_unit(name, units_by_result, location)
             _, case_unit = units_by_result.get(name, ("", ""))
@@ -210,12 +205,28 @@ class ResultNames:
                 factor = column_size(name, unit, case_unit)
             except TableError as e:
                 raise CaseError(f"{location}: {e}") from None
-        # the place of a reading is no result
+        # what the last step prescribes gives the place of a reading, and is no result
         if self.places is None or result != self.places.column:
-            refuse_no_result(scene, [result], location)
+            refuse_no_result(self.scene, [result], location)
             if result in SCALES:
-                refuse_unitless(scene, result)
+                refuse_unitless(self.scene, result)
         return result, case_unit, factor
+
+    def _units_by_result(self) -> dict[str, tuple[str, str]]:
+        """Return name of a result in units of the case -> its dimensionless name, and its unit.
+
+        Critical loads and frequencies in units have no other name here: "buckling_pressure_Pa" ->
+        ("buckling_pressure_Pa", "Pa").
+        """
+        units_by_result = {
+            q.name: (dimensionless_name, q.si)
+            for dimensionless_name in self._dimensionless_names
+            if (q := self.scene.sizes.column(dimensionless_name))
+        }
+        units_by_result |= {
+            result_name: (result_name, result_name.rpartition("_")[2]) for result_name in SCALES
+        } | {"hertz_1": ("hertz_1", "Hz")}
+        return units_by_result
 
     def _refuse_missing_unit(
         self, name: str, units_by_result: Mapping[str, tuple[str, str]], location: str
@@ -235,23 +246,24 @@ class ResultNames:
         CaseError
             With the unit that is missing.
         """
-        unknown = name not in self._bare and name not in FOLDS
-        nearest = next(
+        is_unknown = name not in self._dimensionless_names and name not in FOLDS
+        # the result that the name becomes with a unit behind it
+        name_with_unit = next(
             (
                 result_name
-                for result_name, (base, si) in units_by_result.items()
-                if (base == name and result_name.startswith(f"{name}_"))
-                or (unknown and result_name == f"{name}_{si}")
+                for result_name, (dimensionless_name, unit) in units_by_result.items()
+                if (dimensionless_name == name and result_name.startswith(f"{name}_"))
+                or (is_unknown and result_name == f"{name}_{unit}")
             ),
             None,
         )
-        if nearest and nearest != name:
-            _, unit = units_by_result[nearest]
+        if name_with_unit and name_with_unit != name:
+            _, unit = units_by_result[name_with_unit]
             raise CaseError(f"{location}: {name}: has no unit: write {name} [{unit}]")
 
     @property
-    def _bare(self) -> list[str]:
-        """Names of all results without a unit; that of the place is first."""
+    def _dimensionless_names(self) -> list[str]:
+        """Names of all results without a unit; that of what the last step prescribes is first."""
         scene = self.scene
         place_names = [self.places.dimensionless_column] if self.places else []
         results = differentiable(scene, scene.unloaded())
@@ -265,10 +277,12 @@ class ResultNames:
         CaseError
             If no result has the name.
         """
-        units = [q.name for base_name in self._bare if (q := self.scene.sizes.column(base_name))]
+        names_in_units = [
+            q.name for name in self._dimensionless_names if (q := self.scene.sizes.column(name))
+        ]
         names = [
-            *self._bare,
-            *units,
+            *self._dimensionless_names,
+            *names_in_units,
             *FOLDS,
             # critical loads without their unit
             *(base_name.rpartition("_")[0] for base_name in FOLDS if base_name in SCALES),
@@ -288,22 +302,25 @@ class ResultNames:
             If the unit is missing or of another dimension.
         """
         number, unit = number_and_unit(str(amount))
-        # without a unit the factor is 1, and only zero is allowed for a result with a unit
+        # unit of the result in the case, and the factor from `unit` to it; 1 without a unit
         _, case_unit, factor = (
-            self._of_unit(result, unit, location)
+            self._result_in_another_unit(result, unit, location)
             if unit
             else self.result_of(result, None, location)
         )
+        # zero needs no unit
         if case_unit and not unit and float(number):
             raise CaseError(
                 f"{location}: {_text(amount)}: needs a unit, such as {_text(amount)} {case_unit}"
             )
         return float(number) * factor
 
-    def _of_unit(self, result_name: str, unit: str, location: str) -> tuple[str, str, float]:
-        """Return result, its unit in the case, and the size of another unit in this unit.
+    def _result_in_another_unit(
+        self, result_name: str, unit: str, location: str
+    ) -> tuple[str, str, float]:
+        """Return a result, its unit in the case, and the size of another unit in this unit.
 
-        Unlike `result_of` it takes a name as the case has it, which may end with a unit already.
+        The name is that in the case, which may end with the case's unit: "w_mm".
 
         Raises
         ------
@@ -362,6 +379,7 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
         try:
             number_at_key(case.context, key)  # raises an error if there is no number
             start, unit = _number_as_written(source, case, key)
+            # of the prior, in the unit of the number; nan without a prior
             mean, deviation = (
                 _in_unit_of(unit, amount, key)
                 for amount in (parameter_section.prior, parameter_section.deviation)
@@ -370,11 +388,11 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
             raise CaseError(f"{location}: {e}") from None
         if parameter_section.deviation is not None:
             refuse_size(deviation, parameter_section.deviation, f"{location}.deviation")
-        prior = (mean, deviation) if parameter_section.prior is not None else (start, np.inf)
-        parameters.append(
-            # bounds 0 and 1: the variable of a design is then the number itself
-            Parameter(NumberVariable(key, np.array([start]), (0.0, 1.0), unit), *prior)
-        )
+        if parameter_section.prior is None:
+            mean, deviation = start, np.inf
+        # a variable of a design is scaled with its bounds: with 0 and 1 it is the number itself
+        number = NumberVariable(key, start=np.array([start]), bounds=(0.0, 1.0), unit=unit)
+        parameters.append(Parameter(number, mean, deviation))
     return tuple(parameters)
 
 
@@ -406,7 +424,8 @@ def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
     if amount is None:
         return np.nan
     try:
-        if unit and not number_and_unit(str(amount))[1]:
+        _, unit_of_amount = number_and_unit(str(amount))
+        if unit and not unit_of_amount:
             raise ValueError
         return in_unit(str(amount), unit)
     except ValueError:
@@ -451,7 +470,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     ]
     for axis in SHAPE:
         _refuse_missing(axis, columns[axis], table.lines, location)
-    # equal points get the number of their first row, which in reversed order is written last
+    # a point has the number of the first row with it: in reversed order this one is written last
     point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {point_names[tuple(row)]: row for row in rows}
     # the coordinates as a case has them: text where there is a unit
@@ -461,6 +480,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
         ]
         for name, row in shape.items()
     }
+    # the named points of the case, and these
     data = {**source.data, "points": {**(source.data.get("points") or {}), **texts}}
     shape_source = Source(source.name, data, source.places, source.folder, source.files)
     return shape_source, [point_names[tuple(row)] for row in rows], shape
@@ -538,6 +558,7 @@ def quantity_of(result: str) -> str:
     for quantity in QUANTITIES.values():
         if any(result == in_units.name for in_units in quantity.in_units):
             return quantity.name
+    # any other result: its name without a unit at the end, such as "_mm"
     ending = next((ending for ending in endings() if result.endswith(f"_{ending}")), "")
     return result.removesuffix(f"_{ending}")
 
@@ -571,10 +592,7 @@ def table_of(
     keys, results = dict[str, tuple[str, Array]](), list[tuple[MeasuredColumn, Array]]()
     places = displacement_unit = ""
     for header, values in columns.items():
-        header_match = HEADER.fullmatch(header)
-        name, unit = (
-            (header_match[1], header_match[2] or units[header]) if header_match else (header, None)
-        )
+        name, unit = _name_and_unit(header, units[header])
         # a dotted name is a key of the case: a setting of each row
         if "." in name:
             refuse_twice(header, name, headers_by_result, location)
@@ -590,26 +608,66 @@ def table_of(
         )
         refuse_twice(header, result, headers_by_result, location)
         headers_by_result[result] = header
+        # the column of what the last step prescribes has the places
         if names.places and result == names.places.column:
             _refuse_missing(header, values, rows_of_file.lines, location)
             place_values, places = values * factor, result
             continue
-        noise = section.noise.get(name, section.noise.get(result))
-        deviation = (
-            np.nan if noise is None else names.amount(noise, result, f"identify.noise.{name}")
-        )
-        result = result.removeprefix(rows[0]) if is_displacement else result
-        displacement_unit = case_unit if is_displacement else displacement_unit
-        if noise is not None:
-            refuse_size(deviation, noise, f"identify.noise.{name}")
-        results.append((MeasuredColumn(name, result, case_unit, deviation), values * factor))
+        noise = _noise_of_column(section, names, name, result)
+        if is_displacement:  # of all points: without the name of the first one
+            result, displacement_unit = result.removeprefix(rows[0]), case_unit
+        results.append((MeasuredColumn(name, result, case_unit, noise), values * factor))
     if not results:
         raise CaseError(f"{location}: has no column with a result of this case")
     _refuse_unknown(section, [measured_column for measured_column, _ in results], location)
-    table = _listed(
-        results, keys, place_values, places, section, location, rows, rows_of_file.lines
+    table = _grouped_by_settings(
+        results,
+        keys,
+        place_values,
+        places,
+        section,
+        location,
+        points=rows,
+        lines=rows_of_file.lines,
     )
     return replace(table, shape=_in_displacement_unit(shape or {}, units, displacement_unit))
+
+
+def _name_and_unit(header: str, unit_of_column: str | None) -> tuple[str, str | None]:
+    """Return the name of a column without its unit in brackets, and the unit; None without one.
+
+    Parameters
+    ----------
+    unit_of_column
+        The unit of the column where the header has none in brackets.
+    """
+    header_match = HEADER.fullmatch(header)
+    if not header_match:
+        return header, None
+    return header_match[1], header_match[2] or unit_of_column
+
+
+def _noise_of_column(section: IdentifySection, names: ResultNames, name: str, result: str) -> float:
+    """Return the standard deviation of the noise of a measured column, in the result's unit.
+
+    It is nan if the section does not give it, so that it is to be estimated.
+
+    Parameters
+    ----------
+    name, result
+        Name of the column in the file, and of its result in the case; the section may use either.
+
+    Raises
+    ------
+    CaseError
+        If its unit is missing or of another dimension, or it is not positive or out of bounds.
+    """
+    noise = section.noise.get(name, section.noise.get(result))
+    if noise is None:
+        return np.nan
+    deviation = names.amount(noise, result, f"identify.noise.{name}")
+    refuse_size(deviation, noise, f"identify.noise.{name}")
+    return deviation
 
 
 def _in_displacement_unit(
@@ -664,7 +722,7 @@ def _refuse_unknown(
             )
 
 
-def _listed(
+def _grouped_by_settings(
     results: list[tuple[MeasuredColumn, Array]],
     keys: Mapping[str, tuple[str, Array]],
     place_values: Array,
@@ -675,6 +733,8 @@ def _listed(
     lines: Sequence[int],
 ) -> MeasuredTable:
     """Collect the rows as readings, grouped by their settings; an empty cell was not measured.
+
+    All readings of one case, that of the same settings, are then taken in one run.
 
     Parameters
     ----------
@@ -694,28 +754,25 @@ def _listed(
     CaseError
         If there are no numbers, too many, or not finite ones.
     """
-    # by settings, so that all readings of one case are taken in one run: the readings, their
-    # numbers, the indices of their columns, and their file and line
+    # settings -> the readings with them, their numbers, the indices of their columns, and their
+    # file and line
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
-    row_count = len(results[0][1])
-    for row in range(row_count):
-        settings = tuple(
-            f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items()
-        )
+    _, values_of_first_column = results[0]
+    for row in range(len(values_of_first_column)):
+        settings = _settings_of_row(keys, row)
         place = float(place_values[row]) if places else None
+        point = points[row] if points else ""
         for number, (measured_column, values) in enumerate(results):
-            value, of = float(values[row]), measured_column.of
+            value = float(values[row])
             if np.isnan(value):
                 continue
-            change = of in section.changes or measured_column.header in section.changes
-            # "_ux" is a displacement of the row's point
-            result = f"{points[row]}{of}" if of.startswith("_") else of
-            place_of_result = None if _is_of_whole_path(of) else place
-            readings.setdefault(settings, []).append(Reading(result, place_of_result, change))
+            reading = _reading_of(measured_column, place, point, section)
+            readings.setdefault(settings, []).append(reading)
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
             rows.setdefault(settings, []).append(f"{location}: line {lines[row]}")
+    # all numbers, one settings after the other, and the indices of their columns
     numbers = np.array([value for group in data.values() for value in group])
     if not 0 < len(numbers) <= MOST_READINGS or not np.isfinite(numbers).all():
         raise CaseError(
@@ -724,19 +781,50 @@ def _listed(
     column_numbers = np.array(
         [number for group in column.values() for number in group], dtype=np.int64
     )
-    empty = {
-        measured_column.header: int(np.isnan(values).sum()) for measured_column, values in results
-    }
-    missing = {header: count for header, count in empty.items() if count}
     return MeasuredTable(
-        tuple(measured_column for measured_column, _ in results),
-        readings,
-        numbers,
-        column_numbers,
-        places,
-        missing=missing,
+        columns=tuple(measured_column for measured_column, _ in results),
+        readings=readings,
+        data=numbers,
+        column=column_numbers,
+        places=places,
+        missing=_empty_cells(results),
         rows=rows,
     )
+
+
+def _settings_of_row(keys: Mapping[str, tuple[str, Array]], row: int) -> tuple[str, ...]:
+    """Return the settings `key=value` of a row of the data, with units as in the file."""
+    return tuple(
+        f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items()
+    )
+
+
+def _empty_cells(results: list[tuple[MeasuredColumn, Array]]) -> dict[str, int]:
+    """Return header -> number of rows in which it is empty, of the measured columns with such."""
+    counts = {
+        measured_column.header: int(np.isnan(values).sum()) for measured_column, values in results
+    }
+    return {header: count for header, count in counts.items() if count}
+
+
+def _reading_of(
+    measured_column: MeasuredColumn, place: float | None, point: str, section: IdentifySection
+) -> Reading:
+    """Return the reading of a measured column in one row of the data.
+
+    Parameters
+    ----------
+    place
+        Place of the row; None: the end of the path.
+    point
+        Name of the row's point of a measured shape; "" without a shape.
+    """
+    of, changes = measured_column.of, section.changes
+    # "_ux" is a displacement of the row's point
+    result = f"{point}{of}" if of.startswith("_") else of
+    # whether it counts from the begin of the last step
+    is_change = of in changes or measured_column.header in changes
+    return Reading(result, None if _is_of_whole_path(of) else place, is_change)
 
 
 def _is_of_whole_path(result: str) -> bool:

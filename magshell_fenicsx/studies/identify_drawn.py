@@ -18,7 +18,7 @@ NORMAL = float(scipy.stats.norm.ppf((1 + BAND_PROBABILITY) / 2))
 def posterior_samples(posterior: Posterior, count: int) -> Array:
     """Return parameters (count, p) drawn from the posterior, by a Latin hypercube along its axes.
 
-    They scatter as widely as the 95 % bands, whose quantiles are Student's t.
+    They scatter as widely as the 95 % bands, whose half widths are quantiles of Student's t.
     """
     size = posterior.deviation
     spread, axes = np.linalg.eigh(posterior.correlation)
@@ -26,7 +26,10 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
     rng = np.random.default_rng(0)  # the same samples in each run
     # Latin hypercube: along each axis there is one sample in each of `count` equal quantiles
     stratified = [(rng.permutation(count) + 0.5) / count for _ in size]
-    normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
+    # (count, p) independent normal numbers, without correlations by chance
+    normal = _decorrelated(
+        scipy.stats.norm.ppf(np.transpose(stratified)), longest=np.argsort(-spread)
+    )
     # half widths of Student's t over those of a normal distribution, along each axis; a parameter
     # without deviation does not vary
     inverse_size = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
@@ -53,8 +56,8 @@ def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
     # `reshape`: of a single axis NumPy returns a number
     correlation = np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
     eigenvalues, eigenvectors = np.linalg.eigh(correlation)
-    # over the deviations, times the inverse root of the correlation matrix V diag(w) V^T, which is
-    # V diag(w)^(-1/2) V^T, times the deviations
+    # numbers over their deviations are multiplied by the inverse root of their correlation matrix
+    # V diag(w) V^T, which is V diag(w)^(-1/2) V^T; then they get their deviations again
     uncorrelated = np.array(normal)
     uncorrelated[:, axes] = (
         normal[:, axes]

@@ -2,7 +2,9 @@
 
 The remanence is given by vectors at control points; each place of the shell has their weighted
 mean. Its numbers are the components that may vary, over |B^r|, the size of the remanence. By their
-prior the field is smooth (see `smooth`).
+prior the field is smooth: values at near places are correlated. The strengths of the prior are its
+deviation and its length, over which the correlation falls (`studies.smooth`). The vector of all
+parameters has the numbers of the field in a block.
 """
 
 from collections.abc import Mapping
@@ -101,13 +103,14 @@ class RemanenceField:
         block, prior = self.smooth.block, posterior.measured.field
         assert prior
         shape = (len(self.start), len(self.free_components))
+        # of the 95 % bands of its numbers
         lower_ends, upper_ends = (v[block].reshape(shape) for v in posterior.band)
         # deviation and length that were not given, and ended at a bound of the search
         strengths_at_bounds = [
             name for name in prior.at_bounds() if np.isnan(getattr(self.smooth, name))
         ]
         # number of values that the prior determines: the trace of C Q, with the covariance C of the
-        # posterior and the inverse covariance Q of the prior
+        # posterior and the inverse covariance Q = W^T W of the prior, whose rows are W
         prior_share = np.trace(posterior.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
@@ -130,10 +133,17 @@ class RemanenceField:
 def field_of(
     source: Source, case: Case, section: RemanenceSection | None, first: int
 ) -> tuple[RemanenceField | None, Source]:
-    """Return the remanence that is identified, as parameters from index `first` on; and the case.
+    """Return the remanence that is identified, and the case with it.
 
     The case is that of the whole shell unless the vectors stay in a plane. Without a section the
     field is None, and the case unchanged.
+
+    Parameters
+    ----------
+    section
+        The section `identify.remanence`; None if no field is identified.
+    first
+        Index of the first number of the field in the vector of parameters.
 
     Raises
     ------
@@ -143,6 +153,7 @@ def field_of(
     """
     if section is None:
         return None, source
+    # the control points, and the vectors (n, 2 | 3) of the case there
     controls, start = controls_of(case, section.points, section.filter, FIELD_KEY)
     in_plane = controls.is_axisymmetric or case.shell.geometry == "strip"
     # indices of rho and z of (rho, z) on a meridian, of x and z on a strip, else of x, y and z
@@ -164,9 +175,9 @@ def field_of(
     smooth = Smooth(
         first,
         distances,
-        len(free_components),
-        section.deviation or np.nan,  # the data choose what is not given
-        section.length or np.nan,
+        components=len(free_components),
+        deviation=section.deviation or np.nan,  # the data choose what is not given
+        length=section.length or np.nan,
     )
     if not in_plane:  # identified vectors have no symmetry
         source = Source(
@@ -220,6 +231,7 @@ def words(field: Mapping[str, Any]) -> list[str]:
         f"{NAME}: its prior is smooth over {prior['length']:.3g} R, with the deviation "
         f"{flux_scale['value'] * prior['deviation']:.3g}{unit}",
     ]
+    # deviation or length that the data were to choose, but that ended at a bound of the search
     if prior["at_bounds"]:
         sentences.append(
             f"warning: the data do not say the {' and the '.join(prior['at_bounds'])} of the prior "

@@ -7,7 +7,7 @@ the noise. `plot` is always matplotlib's axes.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -46,6 +46,7 @@ def draw_identified(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    # functions that draw a panel each, called with its axes
     panels = list[Callable[[Any], None]]()
     rows, shape, field = content["rows"], content["shape"], content["remanence"]
     shape_rows = [row for row in rows if row["result"].startswith(OF_POINTS)]
@@ -54,6 +55,7 @@ def draw_identified(
         panels.append(partial(_shape, rows=shape_rows, shape=shape))
         rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
     sorted_rows = sorted(rows, key=lambda row: str(row["column"]))
+    # a panel for each column of the data
     for _, column_rows in groupby(sorted_rows, key=lambda row: str(row["column"])):
         column = list(column_rows)
         # a result of a measured point has the name of its column instead
@@ -96,11 +98,9 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     plane_axes = sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2])
     has_labels = False
     # one shape for each state of the shell; the legend names the first one alone
-    for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
-        # column of a displacement -> name of a point -> its row
-        rows_by_point = dict[str, dict[str, Row]]()
-        for row in of_shape:
-            rows_by_point.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
+    for _, rows_of_shape in groupby(sorted(rows, key=_state_of), key=_state_of):
+        rows_by_point = _rows_by_point(rows_of_shape)
+        # the points that have both displacements
         points = [
             name
             for name in shape
@@ -123,6 +123,7 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
                 lw=1.2,
             )
         has_labels = True
+    # the undeformed places, once
     plot.plot(
         *coordinates,
         "--" if _in_line(coordinates) else ".",
@@ -138,8 +139,19 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     plot.legend(frameon=False, fontsize=8)
 
 
-def _which(row: Row) -> tuple[str, str]:
-    """Return settings and place of a row: the shape at one state."""
+def _rows_by_point(rows: Iterable[Row]) -> dict[str, dict[str, Row]]:
+    """Return column of a displacement ("ux") -> name of a point -> its row."""
+    rows_by_point = dict[str, dict[str, Row]]()
+    for row in rows:
+        # the name of the point stands before the displacement: "measured_3_ux_mm"
+        point_match = POINT.match(row["result"])
+        assert point_match
+        rows_by_point.setdefault(str(row["column"]), {})[point_match[0]] = row
+    return rows_by_point
+
+
+def _state_of(row: Row) -> tuple[str, str]:
+    """Return settings and place of a row, which say at which state of the shell it is."""
     return str(row["settings"]), str(row["at"])
 
 
@@ -182,6 +194,7 @@ def _field(plot: Any, field: Row, number: int) -> None:
         else rf"{symbol} over $|B^\mathrm{{r}}|$"
     )
     if places.shape[1] == 2 or not places[:, 1:].any():  # a meridian, or a strip along x
+        # lengths along the chords between the points, from the first one
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )
@@ -222,6 +235,8 @@ def _data(
         Rows of identify.csv for the column.
     curve
         Places and values along the path at the fit; empty if there are none.
+    content
+        The content of identify.json, whose `places` names the column of the places.
     """
     has_places = all(row["at"] != "end" for row in rows)
     rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if has_places else rows
@@ -230,9 +245,10 @@ def _data(
     on_one_curve = len({row["settings"] for row in rows}) == 1 and has_places
 
     def get(name: str) -> Array:
+        """Return a column of the rows."""
         return np.array([row[name] for row in rows])
 
-    if on_one_curve:
+    if on_one_curve:  # bands, the wider one for measured values
         plot.fill_between(
             x,
             get("low_measured"),
@@ -276,7 +292,7 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
         size = abs(parameter["value"]) or 1.0
         prior = parameter["prior"]
         if prior:
-            # middle of the prior's band, less the fit
+            # middle of the prior's band, less the fit: both over the size of the value
             middle = prior["mean"] / size - np.sign(parameter["value"])
             half_width = 1.96 * prior["deviation"] / size  # 95 %
             plot.barh(

@@ -67,6 +67,10 @@ class Predictor:
     ----------
     source
         The identified case.
+    make_case
+        Makes a case of its source.
+    parameters
+        Numbers of the case that are identified, the first ones of a vector x.
     readings
         Settings of the case -> results and places that are read.
     folder
@@ -100,6 +104,7 @@ class Predictor:
         slopes
             Whether derivatives by the parameters are computed too.
         """
+        # all ranks take the parameters of rank 0
         x = np.array(self.comm.bcast(x))
         settings_and_readings = json.dumps(
             [
@@ -107,7 +112,7 @@ class Predictor:
                 for settings, readings in self.readings.items()
             ]
         )
-        # a file is known by the parameters, and by all that a prediction depends on
+        # the name of the file is a hash of the parameters and of all that a prediction depends on
         text = f"{self.mark} {settings_and_readings} {slopes}".encode()
         name = hashlib.sha256(x.tobytes() + text).hexdigest()[:16]
         file = self.folder / "points" / f"{name}.json"
@@ -167,18 +172,25 @@ class Predictor:
                     invalid=not isinstance(e, LostResult) or isinstance(e, PlaceOutsidePath),
                 )
             prediction.values += [float(v) for v in readings.values]
-            # derivatives are by numbers in SI units: size of each parameter's unit in SI units.
-            # None stands for the scene, which a number does not need
-            slopes_of_keys = (
-                parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
-                for parameter in self.parameters
-            )
-            unit_sizes = [float(slope[0]) for slope in slopes_of_keys]
-            # numbers of a field have no unit
+            # derivatives by numbers in SI units become those by parameters, which are in the units
+            # of the case; numbers of a field have no unit
+            unit_sizes = self._unit_sizes(x)
             unit_sizes += [1.0] * (readings.slopes.shape[1] - len(unit_sizes))
             prediction.slopes += [list(map(float, row)) for row in readings.slopes * unit_sizes]
             prediction.curves = prediction.curves or readings.curves
         return prediction
+
+    def _unit_sizes(self, x: Array) -> list[float]:
+        """Return the size of each parameter's unit in SI units.
+
+        It is the derivative of the number in SI units by the parameter.
+        """
+        # None stands for the scene, which a number does not need
+        slopes_of_keys = (
+            parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
+            for parameter in self.parameters
+        )
+        return [float(slope[0]) for slope in slopes_of_keys]
 
     def _row_of(self, error: Exception, settings: Settings) -> str:
         """Return file and line of the datum whose place is not reached; empty for another error."""

@@ -14,7 +14,7 @@ measurement. A location is the key with which an error message begins.
 
 import copy
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -84,6 +84,8 @@ class Prediction:
 
     Attributes
     ----------
+    name
+        Name of the programme.
     content
         Its part of identify.json.
     said
@@ -112,6 +114,10 @@ class Programme:
 
     Attributes
     ----------
+    name
+        Name of its section in `identify.predict`.
+    make_case
+        Makes a case of its source.
     source
         The case, with its own settings.
     samples
@@ -167,13 +173,16 @@ class Programme:
             self.keys.append(identity(case))
             cases[self.keys[-1]] = case
         folder = predictor.folder
-        missing = predictor.comm.bcast([key for key in cases if self._outcome(folder, key) is None])
+        # runs without a usable outcome in the folder
+        missing = predictor.comm.bcast(
+            [key for key in cases if self._stored_outcome(folder, key) is None]
+        )
         if predictor.comm.rank == 0:
             say(f"{self.name}: {len(cases)} runs, {len(missing)} to compute")
 
         def computed(key: str) -> Iterator[str]:
             """Compute a run on this rank, keep its outcome, and yield a line of text."""
-            outcome = self._run(cases[key])
+            outcome = self._outcome_of_run(cases[key])
             keep_outcome(outcome, cases[key], _file(folder, key))
             reason = f", {outcome.stopped}" if outcome.stopped else ""
             number = missing.index(key) + 1
@@ -207,14 +216,14 @@ class Programme:
             case = self.make_case(
                 predictor.source_at(predictor.comm.bcast(x), self.source, vectors)
             )
-            case.problem()
+            case.problem()  # raises errors of the case
         except CaseError as e:
-            if not number:
+            if not number:  # the run at the fit
                 raise CaseError(f"identify.predict.{self.name}: at the fit: {e}") from None
             return None
         return case
 
-    def _run(self, case: Case) -> Outcome:
+    def _outcome_of_run(self, case: Case) -> Outcome:
         """Run a case on this rank; any exception becomes a failed outcome.
 
         The curve of the outcome keeps only the needed columns.
@@ -229,22 +238,25 @@ class Programme:
             Exception
         ) as e:  # whatever it is, the other runs go on, and the table has no band if many fail
             outcome = Outcome.failed(" ".join(f"{FAILED}{type(e).__name__}: {e}".split()))
-        curve = [{name: row[name] for name in self._needed if name in row} for row in outcome.curve]
+        curve = [
+            {name: row[name] for name in self._needed_columns if name in row}
+            for row in outcome.curve
+        ]
         return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - start_time, 3))
 
     @property
-    def _needed(self) -> dict[str, None]:
+    def _needed_columns(self) -> dict[str, None]:
         """Columns of path.csv that the prediction reads, as keys of a dict in order."""
-        place_and_results = [self.place, *(item.of for item in self.columns)]
+        place_and_results = [self.place, *(column.of for column in self.columns)]
         names = [
             *ALWAYS,
             *place_and_results,
-            *(name for item in self.scalars for name in (item.column, item.at)),
+            *(name for scalar in self.scalars for name in (scalar.column, scalar.at)),
         ]
         # a scalar of the summary has no column; "end" stands for the last point of the path
         return dict.fromkeys(name for name in names if name not in ("", "end"))
 
-    def _outcome(self, folder: Path, key: str) -> Outcome | None:
+    def _stored_outcome(self, folder: Path, key: str) -> Outcome | None:
         """Return the stored outcome of a run; None if it is to be computed.
 
         A stored outcome is not used, and the run computed again, in two cases: it is that of an
@@ -253,8 +265,8 @@ class Programme:
         outcome = stored_outcome_of_case(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
             return None
-        complete = not outcome.curve or self._needed.keys() <= outcome.curve[0].keys()
-        return outcome if complete else None
+        has_needed = not outcome.curve or self._needed_columns.keys() <= outcome.curve[0].keys()
+        return outcome if has_needed else None
 
     def prediction(
         self, folder: Path, posterior: Posterior, noise: Mapping[str, Mapping[str, Any]]
@@ -265,6 +277,8 @@ class Programme:
         ----------
         folder
             Folder of the identification.
+        posterior
+            Not used here: the runs for drawn parameters stand for it.
         noise
             Column -> its noise, as in identify.json; `deviation` is the standard deviation.
 
@@ -282,6 +296,7 @@ class Programme:
             raise CaseError(
                 f"identify.predict.{self.name}: nothing is predicted at the fit: {fit_run.stopped}"
             )
+        # the runs of drawn parameters that have a path
         runs = [item for item in drawn_outcomes if item and item.curve]
         curves = [_PathCurve(item.curve, self.place) for item in (fit_run, *runs)]
         places, steps = self.places, self.steps
@@ -300,20 +315,14 @@ class Programme:
             item.name: self._number(item, fit_run, runs, len(drawn_outcomes))
             for item in self.scalars
         }
-        # data with a band; an empty number is ""
-        measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
-        count_inside = int(
-            sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured)
-        )
-        stopped = [item.stopped for item in runs if item.stopped]
-        lost_count = len(drawn_outcomes) - len(runs)
+        measured_count, count_inside = _counts_of_data(rows)
         content = {
             "samples": len(drawn_outcomes),
-            "without_path": lost_count,
-            "stopped_early": len(stopped),
+            "without_path": len(drawn_outcomes) - len(runs),
+            "stopped_early": sum(1 for item in runs if item.stopped),
             "stopped": fit_run.stopped,
             "places": self.place,
-            "measured": len(measured),
+            "measured": measured_count,
             "inside": count_inside,
             "numbers": numbers,
         }
@@ -400,6 +409,7 @@ class Programme:
         # (runs, places), the fit first
         predicted_values = np.array([curve.values_at(column, places, steps) for curve in curves])
         for i, place in enumerate(places):
+            # at the fit; and the range of 95 % of the runs, None if too few have a value
             value, band = predicted_values[0, i], band_of(predicted_values[1:, i], samples)
             low = high = low_measured = high_measured = np.nan
             if band:
@@ -440,6 +450,7 @@ class Programme:
         values = np.array(
             [np.nan if (v := outcome.value(scalar)) is None else v for outcome in runs]
         )
+        # the range of 95 % of the runs; None if too few have the number
         band = band_of(values, samples)
         low, high = band or (None, None)
         return {
@@ -451,17 +462,19 @@ class Programme:
 
 
 class _PathCurve:
-    """The curve of a run, read step by step; branches and other modes are left out.
+    """The curve of a run, read step by step; branches and excluded modes are left out.
 
     Attributes
     ----------
     _rows
         Rows of path.csv that are left.
+    _place
+        Column of path.csv that gives the places.
 
     Parameters
     ----------
-    place
-        Column of path.csv that gives the places.
+    rows, place
+        All rows of path.csv, and the column that gives the places.
     """
 
     def __init__(self, rows: Sequence[Row], place: str) -> None:
@@ -509,6 +522,19 @@ class _PathCurve:
         return values
 
 
+def _counts_of_data(rows: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """Return the number of data that have a band, and the number of those within their bands.
+
+    Parameters
+    ----------
+    rows
+        Rows of the table; an empty number is "".
+    """
+    measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
+    is_inside = [row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured]
+    return len(measured), int(sum(is_inside))
+
+
 def _file(folder: Path, key: str) -> Path:
     """Return the file of a run's outcome in the folder of the identification."""
     return folder / "points" / f"{key}.json"
@@ -540,20 +566,8 @@ def programme(
         If the case or a setting is not valid, a parameter is missing, or there is no such result.
     """
     location = f"identify.predict.{name}"
-    base = copy.deepcopy(source)
     try:
-        if section.case:
-            base = read_source(source.folder / section.case)
-        for setting in section.settings:
-            override(base, setting)
-        for key in ("identify", "ensemble", "design"):  # a run does not need them
-            base.data.pop(key, None)
-        if lacking := next(
-            (p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None
-        ):
-            raise CaseError(f"{section.case or 'the case'} has no {lacking}, which is looked for")
-        if with_field and (missing_room := without_room(base.data, source.data)):
-            raise CaseError(f"{section.case or 'the case'}: {missing_room}")
+        base = _case_of_programme(source, parameters, section, with_field=with_field)
         problem = make_case(base).problem()
     except CaseError as e:
         raise CaseError(f"{location}: {e}") from None
@@ -568,20 +582,10 @@ def programme(
     steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     if section.data:
         place, places, steps, columns = _measured(
-            source.folder / section.data, names, last_step, f"{location}.data"
+            source.folder / section.data, names, last=last_step, location=f"{location}.data"
         )
-    measured = {key.of for key in columns}
-    # a name with "@" is a number at one place, a scalar; columns without data have no values
-    further_columns = [
-        (result, names.in_case_units(result))
-        for result in section.of
-        if "@" not in result and result in names.all
-    ]
-    columns += [
-        PathColumn(result, column, np.zeros(0), change=False)
-        for result, column in further_columns
-        if column not in measured
-    ]
+    columns += _columns_without_data(section, names, measured={column.of for column in columns})
+    # a name with "@" is a number at one place; other names that are no columns are scalars too
     scalars = [
         _scalar(result, location)
         for result in section.of
@@ -592,18 +596,84 @@ def programme(
             f"{location}.of: the case has no step, so no column along it: give a number, such as "
             "knockdown"
         )
-    predicted = {text for key in columns for text in (key.header, key.of)}
+    predicted = {text for column in columns for text in (column.header, column.of)}
     if unknown := next((result for result in section.changes if result not in predicted), None):
         raise CaseError(
             f"{location}.changes: {unknown}: is no column that is predicted; these are "
             f"{', '.join(predicted)}"
         )
     columns = [
-        replace(key, change=bool({key.header, key.of} & {*section.changes})) for key in columns
+        replace(column, change=bool({column.header, column.of} & {*section.changes}))
+        for column in columns
     ]
     return Programme(
-        name, base, section.samples, make_case, last_step, place, places, steps, columns, scalars
+        name=name,
+        source=base,
+        samples=section.samples,
+        make_case=make_case,
+        last=last_step,
+        place=place,
+        places=places,
+        steps=steps,
+        columns=columns,
+        scalars=scalars,
     )
+
+
+def _case_of_programme(
+    source: Source, parameters: Sequence[Parameter], section: ProgrammeSection, *, with_field: bool
+) -> Source:
+    """Return the case that is predicted: the identified or another one, with the settings.
+
+    Parameters
+    ----------
+    source
+        The identified case.
+    with_field
+        Whether a remanence field is identified; the case must then have room for its points.
+
+    Raises
+    ------
+    CaseError
+        If the case or a setting is not valid, or lacks a parameter or the room for the field.
+    """
+    case_source = copy.deepcopy(source)
+    if section.case:
+        case_source = read_source(source.folder / section.case)
+    for setting in section.settings:
+        override(case_source, setting)
+    for key in ("identify", "ensemble", "design"):  # a run does not need them
+        case_source.data.pop(key, None)
+    if missing_key := next(
+        (p.key for p in parameters if value_at(case_source.data, p.key.split(".")) is None), None
+    ):
+        raise CaseError(f"{section.case or 'the case'} has no {missing_key}, which is looked for")
+    if with_field and (missing_room := without_room(case_source.data, source.data)):
+        raise CaseError(f"{section.case or 'the case'}: {missing_room}")
+    return case_source
+
+
+def _columns_without_data(
+    section: ProgrammeSection, names: "_PathColumnNames", measured: Container[str]
+) -> list[PathColumn]:
+    """Return the columns along the last step that the section asks for beside the measured ones.
+
+    Parameters
+    ----------
+    measured
+        Columns of path.csv that are measured.
+    """
+    # name in the section, and column in the case's units; a name with "@" is a scalar
+    names_and_columns = [
+        (result, names.in_case_units(result))
+        for result in section.of
+        if "@" not in result and result in names.all
+    ]
+    return [
+        PathColumn(result, of=column, data=np.zeros(0), change=False)
+        for result, column in names_and_columns
+        if column not in measured
+    ]
 
 
 def refuse_unfit_programmes(
@@ -629,7 +699,7 @@ def refuse_unfit_programmes(
 
 
 def _scalar(result: str, location: str) -> Scalar:
-    """Read the name of a number of a run, as of `--result`.
+    """Read the name of a number of a run, such as "knockdown" or "force_N@w_mm=2".
 
     Raises
     ------
@@ -686,16 +756,20 @@ class _PathColumnNames:
             If there is no such column, or a unit is missing or of another dimension.
         """
         # name of a column in the units of the case -> its unit
-        in_units = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
+        unit_of_column = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
         if unit is None:
             if name not in self.all or name in TEXTS:
                 raise CaseError(f"{location}: {name}: is no column of path.csv of this case")
             if (column_in_units := self.in_case_units(name)) != name:
                 raise CaseError(
-                    f"{location}: {name}: has no unit: write {name} [{in_units[column_in_units]}]"
+                    f"{location}: {name}: has no unit: "
+                    f"write {name} [{unit_of_column[column_in_units]}]"
                 )
             return name, 1.0
-        fitting = [column for column in in_units if column == name or column.startswith(f"{name}_")]
+        # the column itself, or the name with an ending, such as its unit
+        fitting = [
+            column for column in unit_of_column if column == name or column.startswith(f"{name}_")
+        ]
         if not fitting:
             raise CaseError(
                 f"{location}: {name}: has the unit {unit}, but no column of this name has one in "
@@ -703,7 +777,7 @@ class _PathColumnNames:
             )
         column = min(fitting, key=len)  # the shortest: nothing but a unit behind the name
         try:
-            return column, column_size(name, unit, in_units[column])
+            return column, column_size(name, unit, unit_of_column[column])
         except TableError as e:
             raise CaseError(f"{location}: {e}") from None
 
@@ -746,7 +820,8 @@ def _measured(
         raise CaseError(
             f"{location}: needs two columns or more: the place first, then what was measured there"
         )
-    # for each column its header, its column of path.csv, the factor of its unit, and its numbers
+    # for each column its header, its column of path.csv, the size of its unit in that of path.csv,
+    # and its numbers
     measured = [
         (header, *names.column_of(header, units[header], location), values)
         for header, values in values_by_header.items()
@@ -758,13 +833,35 @@ def _measured(
     # the first column has the places
     (_, place, factor, place_values), *measured_results = measured
     steps = np.asarray(columns.get("step", np.full(place_values.size, last)))
-    has_wrong_step = ~np.isin(steps, np.arange(1, last + 1))
-    bad_rows = np.flatnonzero(np.isnan(place_values) | has_wrong_step)
-    if bad_rows.size:
-        line = rows.lines[bad_rows[0]]
-        raise CaseError(f"{location}: line {line}: a row has no place, or no step of 1 to {last}")
+    _refuse_bad_rows(place_values, steps, last, rows.lines, location)
     path_columns = [
         PathColumn(header, of=result, data=values * factor_of_column, change=False)
         for header, result, factor_of_column, values in measured_results
     ]
     return place, place_values * factor, steps.astype(np.int64), path_columns
+
+
+def _refuse_bad_rows(
+    places: Array, steps: Array, last: int, lines: Sequence[int], location: str
+) -> None:
+    """Check that each row of the data has a place, and a step of the case.
+
+    Parameters
+    ----------
+    places, steps
+        (n,) place and step of each row; nan where a cell is empty.
+    last
+        Number of the last step, counted from 1.
+    lines
+        Line of each row in the file, for the message.
+
+    Raises
+    ------
+    CaseError
+        With the line of the first row that is wrong.
+    """
+    has_wrong_step = ~np.isin(steps, np.arange(1, last + 1))
+    bad_rows = np.flatnonzero(np.isnan(places) | has_wrong_step)
+    if bad_rows.size:
+        line = lines[bad_rows[0]]
+        raise CaseError(f"{location}: line {line}: a row has no place, or no step of 1 to {last}")

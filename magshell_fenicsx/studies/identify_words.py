@@ -86,6 +86,7 @@ def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
     # estimated noise always fits the residuals; only given noise can be too small
     if not np.isnan(measured.noise).any():
         deviations = (measured.data - posterior.y) / posterior.noise[table.column]
+        # is so large a sum of squares unlikely by chance?
         chi_squared = float((deviations**2).sum())
         if scipy.stats.chi2.sf(chi_squared, max(len(measured.data), 1)) < UNLIKELY:
             lines.append(
@@ -93,13 +94,14 @@ def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
                 "model does not describe these data, or their noise is larger; leave it out to "
                 "have it estimated"
             )
-    # by how much the misfit differs from a parabola, and where nothing is predicted
-    bent, lost_count = content["normal"]["difference"], content["normal"]["lost"]
-    if bent > NORMAL or lost_count:
+    # the largest relative difference of the misfit from its parabola, at the ends of the bands; and
+    # the number of these ends at which nothing is predicted
+    misfit_difference, lost_count = content["normal"]["difference"], content["normal"]["lost"]
+    if misfit_difference > NORMAL or lost_count:
         nowhere = f", and at {lost_count} such places nothing is predicted" if lost_count else ""
         lines.append(
-            f"warning: at the ends of the bands the misfit differs by {100 * bent:.0f} % from its "
-            f"parabola{nowhere}: the bands are rough"
+            "warning: at the ends of the bands the misfit differs by "
+            f"{100 * misfit_difference:.0f} % from its parabola{nowhere}: the bands are rough"
         )
     if content["ended"] != "converged":
         lines.append(f"warning: the fit has not converged: {content['ended']}")

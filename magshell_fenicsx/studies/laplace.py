@@ -104,8 +104,8 @@ class Measured:
         If parameters x have their prior distribution, W (mean - x) has independent components with
         standard deviation one.
         """
-        W = np.diag(1 / self.deviation)
-        if self.field:
+        W = np.diag(1 / self.deviation)  # each parameter for itself
+        if self.field:  # the numbers of a field depend on each other: a block of its own
             W[self.field.block, self.field.block] = self.field.rows
         return np.asarray(W)
 
@@ -179,9 +179,8 @@ class Posterior:
         """
         if not self.measured.field:
             return self.covariance
-        return _covariance(
-            self.measured.rows(self.y, self.slopes, self.x, self.noise)[1], self.deviation
-        )
+        _, scaled_slopes = self.measured.rows(self.y, self.slopes, self.x, self.noise)
+        return _covariance(scaled_slopes, self.deviation)
 
     @property
     def correlation(self) -> Array:
@@ -264,6 +263,8 @@ def fit_posterior(
     ----------
     model
         Parameters (p,) -> prediction and slopes; None where there is none.
+    measured
+        Data, noise and priors, with nan for noise and strengths that are to be found.
     start, size
         (p,) where the iteration starts, and the scale of each parameter, for conditioning.
     max_steps
@@ -282,7 +283,8 @@ def fit_posterior(
     assert first_prediction, "there is a prediction at the start"
     # `initial` keeps nan for what is unknown; `measured` has its present estimate
     x, (y, J), initial = np.array(start), first_prediction, measured
-    measured, noise, freedom = _weighed(initial, measured, x, y, J, _guessed(measured, y), size)
+    noise = _first_noise(measured, y)
+    measured, noise, freedom = _with_strengths_and_noise(initial, measured, x, y, J, noise, size)
     ended = f"{max_steps} steps"
     for step in range(max_steps + 1):
         scaled_residuals, A = measured.rows(y, J, x, noise)
@@ -291,7 +293,8 @@ def fit_posterior(
         report_step(step, x, misfit / len(measured.data))
         if step == max_steps:  # the last pass only reports
             break
-        # the full step; the iteration ends if it is short for each parameter
+        # the full step, by least squares in scaled parameters; the iteration ends if the step is
+        # short for each parameter
         dx = size * np.linalg.lstsq(A * size, scaled_residuals, rcond=None)[0]
         covariance = _covariance(A, size)
         deviation = np.sqrt(np.diag(covariance))
@@ -303,26 +306,40 @@ def fit_posterior(
             ended = "no step lowers the misfit"
             break
         x, (y, J) = lowered
-        measured, noise, freedom = _weighed(initial, measured, x, y, J, noise, size)
-    # columns whose residuals are left almost no freedom by the parameters
-    if (silent := np.flatnonzero(freedom < MIN_NOISE_FREEDOM)).size:
-        raise NoNoise(int(silent[0]))
-    covariance = _covariance(measured.rows(y, J, x, noise)[1], size)
+        measured, noise, freedom = _with_strengths_and_noise(
+            initial, measured, x, y, J, noise, size
+        )
+    _refuse_without_noise(freedom)
+    _, A = measured.rows(y, J, x, noise)
+    covariance = _covariance(A, size)
     if measured.field:  # the strengths of its prior are uncertain too
         covariance = _Strength(initial, measured, x, y, J, noise, size).covariance()
     return Posterior(
-        x,
-        y,
-        J,
-        measured.group,
-        noise,
-        np.maximum(freedom, MIN_FREEDOM),
-        covariance,
-        misfit,
-        step,
-        ended,
-        measured,
+        x=x,
+        y=y,
+        slopes=J,
+        group=measured.group,
+        noise=noise,
+        freedom=np.maximum(freedom, MIN_FREEDOM),
+        covariance=covariance,
+        misfit=misfit,
+        steps=step,
+        ended=ended,
+        measured=measured,
     )
+
+
+def _refuse_without_noise(freedom: Array) -> None:
+    """Check that data leave enough degrees of freedom, of each column, to estimate its noise.
+
+    Raises
+    ------
+    NoNoise
+        With the first column whose data the parameters follow too closely.
+    """
+    columns_without_noise = np.flatnonzero(freedom < MIN_NOISE_FREEDOM)
+    if columns_without_noise.size:
+        raise NoNoise(int(columns_without_noise[0]))
 
 
 def _lowered(
@@ -345,8 +362,8 @@ def _lowered(
         next_x = x + dx / 2**halved
         prediction = model(next_x)
         if prediction is not None:
-            residuals = measured.rows(*prediction, next_x, noise)[0]
-            if residuals @ residuals < misfit:
+            scaled_residuals, _ = measured.rows(*prediction, next_x, noise)
+            if scaled_residuals @ scaled_residuals < misfit:
                 return next_x, prediction
     return None
 
@@ -369,6 +386,8 @@ def _covariance(A: Array, size: Array) -> Array:
 def _refuse_unseen(A: Array) -> None:
     """Check that every combination of parameters has an influence on data or priors.
 
+    Only then the fit has one solution.
+
     Parameters
     ----------
     A
@@ -379,6 +398,7 @@ def _refuse_unseen(A: Array) -> None:
     NotSeen
         With the parameters of a combination without influence.
     """
+    # a parameter alone without influence
     length = np.linalg.norm(A, axis=0)
     if (idle := np.flatnonzero(length == 0)).size:
         raise NotSeen(idle)
@@ -388,8 +408,10 @@ def _refuse_unseen(A: Array) -> None:
         raise NotSeen(np.flatnonzero(np.abs(V[-1]) > MIN_NAMED_COMPONENT))
 
 
-def _guessed(measured: Measured, y: Array) -> Array:
+def _first_noise(measured: Measured, y: Array) -> Array:
     """Return the noise of the columns to begin with: as given, or from the residuals.
+
+    From residuals it is their root mean square.
 
     Parameters
     ----------
@@ -403,7 +425,7 @@ def _guessed(measured: Measured, y: Array) -> Array:
     return noise
 
 
-def _weighed(
+def _with_strengths_and_noise(
     initial: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
     """Choose the strengths of a field's prior, and estimate noise that is not given.
@@ -431,9 +453,10 @@ def _weighed(
     """
     if measured.field:
         measured, noise = _Strength(initial, measured, x, y, J, noise, size).best()
-        _, freedom = _estimated(measured, y, J, noise, size)
+        _, freedom = _estimated_noise(measured, y, J, noise, size)
         return measured, noise, freedom
-    return measured, *_estimated(measured, y, J, noise, size)
+    noise, freedom = _estimated_noise(measured, y, J, noise, size)
+    return measured, noise, freedom
 
 
 @dataclass(frozen=True)
@@ -509,18 +532,21 @@ class _Strength:
     def surprise(self, z: Array) -> float:
         """Return -2 ln p(d), up to a constant: how surprising the data are for strengths z.
 
-        The parameters are integrated over; the module `smooth` has the formula.
+        The parameters are integrated over. This leaves sum ln noise^2 - ln det Q + ln det A^T A,
+        and the least misfit of the linear model. Q is the inverse covariance of the field, and A
+        has the slopes of data and priors over their standard deviations.
         """
         measured, noise = self.weighed(z)
         residuals, A = self._rows(z)
         assert measured.field
-        # A = Q R: the least misfit is the part of the residuals that Q does not span, and
-        # det A^T A = (det R)^2
-        Q, R = np.linalg.qr(A * self.size)
-        smallest_misfit = residuals @ residuals - np.sum((Q.T @ residuals) ** 2)
+        log_det_Q = measured.field.determinant
+        # A = U R with orthonormal columns of U: the least misfit is the part of the residuals that
+        # U does not span, and det A^T A = (det R)^2
+        U, R = np.linalg.qr(A * self.size)
+        smallest_misfit = residuals @ residuals - np.sum((U.T @ residuals) ** 2)
         noise_term = 2 * np.log(noise[measured.group]).sum()
         log_determinant = 2 * np.log(np.abs(np.diag(R))).sum()
-        return float(noise_term - measured.field.determinant + log_determinant + smallest_misfit)
+        return float(noise_term - log_det_Q + log_determinant + smallest_misfit)
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
         """Return residuals and slopes over their standard deviations, at x, for strengths z."""
@@ -533,13 +559,15 @@ class _Strength:
         The search begins at the best of several starts.
         """
         given_prior, start_prior = self.fields_of_priors
-        z = min((self.z(*start) for start in start_prior.starts(given_prior)), key=self.surprise)
+        # of several starts the one under which the data are most likely
+        starts = start_prior.starts(given_prior)
+        z = min((self.z(deviation, length) for deviation, length in starts), key=self.surprise)
         if len(z):  # something is not given
-            # bounds of the unknown strengths, then of the unknown noises
+            # pairs (least, largest) of the unknown strengths, then of the unknown noises
             bounds = [given_prior.bounds[i] for i in self.unknown_strengths]
             smallest_noise = MIN_RELATIVE_NOISE * float(np.abs(self.measured.data).max())
             bounds += [(smallest_noise, 1e3 * float(self.noise[i])) for i in self.unknown]
-            limits = np.log(bounds)
+            limits = np.log(bounds)  # (len(z), 2)
             # first simplex: strengths and noises vary by exp(0.5)
             simplex = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
             options = {
@@ -564,42 +592,58 @@ class _Strength:
         z = self.z(start_prior.deviation, start_prior.length)
         count = len(self.unknown_strengths) + len(self.unknown)
         if not count:  # nothing to average over
-            return _covariance(self._rows(z)[1], self.size)
-
-        def second_difference(a: Array, b: Array) -> float:
-            """Return the second derivative of -ln p(d) along two axes, with steps a and b."""
-            differences = [
-                sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
-            ]
-            return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
-
-        # samples are normal, along the principal axes of the curvature of -ln p(d): a little wider
-        # than a normal distribution with this curvature
-        step = LOG_STRENGTH_STEP * np.eye(count)
-        curvatures, axes = np.linalg.eigh([[second_difference(a, b) for b in step] for a in step])
-        scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
-        # quasi-random; the first point of the sequence, zero, would be at infinity
-        normal_samples = scipy.stats.norm.ppf(
-            scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:]
-        )
-        samples = z + normal_samples @ scaled_axes.T
-        # importance weights: likelihood over the density of the samples
-        logarithms = (
-            np.array([-self.surprise(sample) / 2 for sample in samples])
-            + (normal_samples**2).sum(axis=1) / 2
-        )
-        weights = np.exp(logarithms - logarithms.max())
+            _, A = self._rows(z)
+            return _covariance(A, self.size)
+        samples, weights = self._weighted_samples(z)
         # second moments of the parameters about x, averaged over the samples
         total = np.zeros((len(self.x), len(self.x)))
-        for weight, sample in zip(weights / weights.sum(), samples, strict=True):
-            residuals, A = self._rows(sample)
+        for k, weight in enumerate(weights):
+            residuals, A = self._rows(samples[k])
             offset = self.size * np.linalg.lstsq(A * self.size, residuals, rcond=None)[0]
             # scatter of the parameters for this sample, and the offset of their best values from x
             total += weight * (_covariance(A, self.size) + np.outer(offset, offset))
         return total
 
+    def _weighted_samples(self, z: Array) -> tuple[Array, Array]:
+        """Return vectors (k, len(z)) that scatter about the best vector z, and their weights (k,).
 
-def _estimated(
+        The samples are normal, along the principal axes of the curvature of -ln p(d) at z. They
+        scatter a little more widely than a normal distribution with this curvature. A weight is
+        the likelihood over the density of the samples (importance sampling); their sum is one.
+        """
+        curvatures, axes = np.linalg.eigh(self._curvature_matrix(z))
+        scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
+        # quasi-random; the first point of the sequence, zero, would be at infinity
+        normal_samples = scipy.stats.norm.ppf(
+            scipy.stats.qmc.Halton(len(z), scramble=False).random(SAMPLES + 1)[1:]
+        )
+        samples = z + normal_samples @ scaled_axes.T
+        # logarithm of the likelihood, less that of the density
+        logarithms = (
+            np.array([-self.surprise(sample) / 2 for sample in samples])
+            + (normal_samples**2).sum(axis=1) / 2
+        )
+        weights = np.exp(logarithms - logarithms.max())
+        return samples, weights / weights.sum()
+
+    def _curvature_matrix(self, z: Array) -> Array:
+        """Return the second derivatives (len(z), len(z)) of -ln p(d) at z, by differences."""
+
+        def second_difference(a: Array, b: Array) -> float:
+            """Return the second derivative along two axes, with steps a and b.
+
+            The differences are those of -2 ln p(d), between four points z +- a +- b.
+            """
+            differences = [
+                sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
+            ]
+            return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
+
+        steps = LOG_STRENGTH_STEP * np.eye(len(z))
+        return np.array([[second_difference(a, b) for b in steps] for a in steps])
+
+
+def _estimated_noise(
     measured: Measured, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Array, Array]:
     """Estimate the noise of columns where it is not given, and its degrees of freedom.
@@ -646,6 +690,12 @@ def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
     parameters over their deviations. If the difference is small, the posterior is normal, and the
     bands are right.
 
+    Parameters
+    ----------
+    model
+        Parameters (p,) -> prediction, and slopes, which are not used here; None where there is
+        none.
+
     Returns
     -------
     worst
@@ -669,7 +719,7 @@ def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
             if prediction is None:
                 lost_count += 1
                 continue
-            residuals = posterior.measured.rows(*prediction, x, posterior.noise)[0]
-            rise = float(residuals @ residuals - posterior.misfit)
+            scaled_residuals, _ = posterior.measured.rows(*prediction, x, posterior.noise)
+            rise = float(scaled_residuals @ scaled_residuals - posterior.misfit)
             worst = max(worst, abs(rise / quantile**2 - 1))
     return worst, lost_count

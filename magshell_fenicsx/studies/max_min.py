@@ -95,11 +95,7 @@ def raise_lowest(
     iterations
         Largest number of evaluations after that of `first`.
     """
-    low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
-    # no bound: None has become nan
-    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-    # half the ranges; 1 for variables without bounds, such as angles
-    span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
+    low, high, span = _bounds_and_spans(limits)
 
     def evaluate_point(x: Array) -> _EvaluatedPoint | None:
         """Return values and slopes at variables x (p,); None if the path is lost."""
@@ -144,15 +140,39 @@ def raise_lowest(
     return "iteration limit reached"
 
 
+def _bounds_and_spans(
+    limits: Sequence[tuple[float | None, float | None]],
+) -> tuple[Array, Array, Array]:
+    """Return lower and upper bounds (p,), infinite where there is none, and half the ranges (p,).
+
+    The latter are 1 for variables without bounds, such as angles.
+    """
+    low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
+    # no bound: None has become nan
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
+    return low, high, span
+
+
 def _penalised_step(
     best: _EvaluatedPoint,
     others: Sequence[_EvaluatedPoint],
     box: tuple[Array, Array],
     penalty: float,
 ) -> tuple[Array, float, float]:
-    """Predict the step as `_predicted_step`, and raise the penalty as long as this helps.
+    """Predict the step to the highest point under all planes, with a penalty that is large enough.
 
-    A larger penalty helps if it lowers the remaining violation to half of it or less.
+    The penalty is raised as long as this helps. A larger penalty helps if it lowers the remaining
+    violation to half of it or less.
+
+    Parameters
+    ----------
+    others
+        Earlier points, whose planes count too.
+    box
+        Least and largest step, (p,) each.
+    penalty
+        Factor of the largest violation of a constraint, to begin with.
 
     Returns
     -------
@@ -203,7 +223,7 @@ def _predicted_step(
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         offset = best.y - other.y
-        # an old plane counts at least as high as the bound of curvature
+        # the least height of an old plane, by the bound of curvature
         lowest = best.values.min() + CURVATURE_BOUND * offset @ offset
         planes.append(np.maximum(other.values + other.slopes @ offset, lowest))
         slopes.append(other.slopes)

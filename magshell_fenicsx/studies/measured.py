@@ -60,7 +60,7 @@ Origin = Mapping[str, str | None]
 
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
-    """Return the usable measurements of an earlier study in a file; empty ones without any.
+    """Return the measurements of an earlier study in a file; empty ones if none can be used.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def _read(file: Path) -> Timings | None:
 
 
 def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:
-    """Return whether summary.json is of these sources and mesh file."""
+    """Return whether summary.json is of these sources and mesh file; not if there is none."""
     return summary is not None and all(summary.get(key) == value for key, value in origin.items())
 
 

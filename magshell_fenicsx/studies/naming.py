@@ -52,6 +52,7 @@ def key_words(key: str, unit: str = "") -> str:
     words = f"{parent} {last_word}" if needs_parent else name
     if last_word in UNITS:
         words = f"{last_word} angle of {parent}" if parent else f"{last_word} angle"
+    # the numbers of coordinates become their letters
     words = re.sub(r"^position ([012])$", lambda axis: f"position {'xyz'[int(axis[1])]}", words)
     step = re.match(r"loading\.(\d+)\.", key)
     return words.replace("_", " ") + (f" of step {int(step[1]) + 1}" if step else "")

@@ -146,7 +146,7 @@ def _range(text: str, values: str) -> tuple[str, ...]:
         raise CaseError(f"--over {text}: start and stop must be finite")
     if not 2 <= count <= MOST_POINTS:
         raise CaseError(f"--over {text}: count is {count}; allowed 2 to {MOST_POINTS}")
-    # + 0.0: no -0
+    # adding 0.0 turns -0.0 into 0.0
     return tuple(f"{value + 0.0:.12g} {unit}".rstrip() for value in np.linspace(start, stop, count))
 
 
@@ -260,9 +260,9 @@ def make_point(
 
 
 def identity(case: Case) -> str:
-    """Return a hash of the problem: the resolved case, without a zero field, and its mesh file.
+    """Return a hash of the problem: of the case with its defaults, and of its mesh file.
 
-    A magnetic section that has no effect does not count.
+    A magnetic section that has no effect does not count, as one with a field of zero.
     """
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
@@ -278,7 +278,7 @@ def identity(case: Case) -> str:
 
 
 def short_key(key: str) -> str:
-    """The short name of a key: `energy`, `remanent.polar`."""
+    """Return the last word of a key, for an angle with the word before: "remanent.polar"."""
     words = key.split(".")
     return ".".join(words[-2:] if words[-1] in ("polar", "azimuth") else words[-1:])
 

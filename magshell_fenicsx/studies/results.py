@@ -73,8 +73,9 @@ class Scalar:
             return _number(first_snap.get(OF_SNAPS[self.name]))
         # a number of the path; branches and excluded modes are left out
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
-        # "end" is no column
-        if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
+        # the rows must have both columns; "end" is no column
+        needed_columns = {self.column, self.at} - {"end"}
+        if not path or not needed_columns <= set(path[0]):
             return None
         if self.at == "end":
             return float(path[-1][self.column])
@@ -106,6 +107,7 @@ def parse_scalar(text: str) -> Scalar:
             "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients "
             "take it as a result"
         )
+    # both names must be columns with numbers; "end" has no second one
     for name in (column, place_column) if place != "end" else (column,):
         if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
             raise CaseError(
@@ -151,7 +153,7 @@ def _crossing(
         # a target is reached within the solver's tolerance
         target_reached = bool(places) and math.isclose(places[-1], value, rel_tol=1e-9)
         return float(path[-1][column]) if target_reached else None
-    # one more point on either side, if the same load varies there
+    # the interval's ends, and one more point on either side if the same load varies there
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
         first -= 1

@@ -215,6 +215,7 @@ def compute(
             else ""
         )
 
+    # `progress` says lines, and after a long silence that the work goes on
     with _wait_for_all(comm), heard(comm, say, remaining_text) as progress:
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
@@ -232,7 +233,7 @@ class Heard:
     _say, _rest
         The parameters `say` and `remaining_text`.
     _begun, _last
-        Time of the begin, and of the last line.
+        Time of the begin, and of the last line, of `time.perf_counter`.
     _ended
         Event that ends the thread.
 
@@ -345,6 +346,7 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
     if comm.rank == 0:
         window.tomemory()[:] = counter.tobytes()
     comm.Barrier()
+    # `number` gets the value of the counter
     increment, number = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     while True:
         # add one to the counter, and get its value before
@@ -481,6 +483,7 @@ def outcome_of(
         result.limit_points,
         key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
     )
+    # columns of the curve, each once and in order
     kept_columns = dict.fromkeys((*columns, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,

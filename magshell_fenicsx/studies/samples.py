@@ -36,7 +36,7 @@ class Sample:
     case
         The validated case.
     key
-        Hash of the problem, see `identity`.
+        Hash of the problem.
     """
 
     number: int
@@ -69,9 +69,9 @@ def make_samples(
     section = make_case(source).ensemble
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
-    shells = list(source.data.get("shells") or ())
+    shells = list(source.data.get("shells") or ())  # names of several shells
     try:
-        section.refuse_unfit(shells)
+        section.refuse_unfit(shells)  # defects must be on shells of the case
     except ValueError as e:
         raise CaseError(str(e)) from None
     refuse_unknown_keys(source, section, make_case)
@@ -128,7 +128,7 @@ def _sample(
             raise CaseError(
                 f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects"
             )
-        # by identity, as two defects may be equal
+        # removed by identity, as two defects may be equal; `_defects` has the items of the data
         deleted_ids = {id(defect) for defect in ranked[:deleted]}
         for shell, _ in _shells(drawn_source.data, case):
             if "imperfections" in shell:
@@ -167,7 +167,7 @@ def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
     """
     sizes_and_defects = list[tuple[float, dict[str, Any]]]()
     for shell, section in _shells(data, case):
-        # `defect` is short for one imperfection, in data and section alike
+        # data, and sections, of the imperfections; the key `defect` is short for a single one
         defects = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
         single_defect = getattr(section, "defect", None)
         sections = section.imperfections or ([single_defect] if single_defect else [])
@@ -179,8 +179,8 @@ def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
 
 
 def _shells(data: Any, case: Case) -> list[tuple[dict[str, Any], Any]]:
-    """Return plain data and section of each shell of the case."""
-    if case.shells:
+    """Return pairs of the plain data of each shell of the case, and of its section."""
+    if case.shells:  # several
         return [
             (data["shells"][name]["shell"], member.shell) for name, member in case.shells.items()
         ]
@@ -217,7 +217,7 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, make_case: Mak
     except InvalidCase as e:
         messages += e.lines_of_kinds(*OF_KEYS)
     except CaseError:
-        pass  # a matter of the values
+        pass  # of the medians, not of the keys
     if messages:
         raise CaseError(in_the_file("\n".join(messages), source, medians))
 

@@ -72,7 +72,7 @@ class Smooth:
 
         The least l is the median distance of neighbours.
         """
-        # without the distance of each place to itself
+        # the distance of each place to itself counts as infinite, so that another one is nearest
         distances = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
         shortest = float(np.median(distances.min(axis=1)))
         return (WEAKEST, STRONGEST), (shortest, LONGEST * float(self.distances.max()))
@@ -81,7 +81,7 @@ class Smooth:
     def _factor(self) -> tuple[Array, float]:
         """W (n, n) with W^T W = Q, and ln det Q, of one component.
 
-        With the covariance L L^T, W is the inverse of L.
+        The covariance is L L^T, with a lower triangle L. W is the inverse of L.
         """
         r = np.sqrt(3) * self.distances / self.length
         K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
@@ -119,7 +119,7 @@ class Smooth:
         """Return pairs (s, l) from which a search begins.
 
         If this prior has values, of an earlier search, they are the only start. If it has none, the
-        starts are spread between the bounds; but s, or l, keeps its value where that is given.
+        starts are spread between the bounds. But an s or l that is given keeps its value.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ class Smooth:
         if np.isfinite(self.deviation):
             return [(self.deviation, self.length)]
         _, (shortest, longest) = self.bounds
-        # deviations over the field's unit
+        # deviations over the field's unit, the given one alone if there is one
         deviations = (
             np.geomspace(0.03, 3.0, START_VALUES)
             if np.isnan(prior.deviation)

@@ -43,7 +43,7 @@ STATUS = {
 }
 RESAMPLED = 300
 MIN_SAMPLES_FOR_CORRELATION = 3  # samples for a correlation
-LEAST_DIFFERENT = 8  # different values for three parameters
+LEAST_DIFFERENT = 8  # different values of a sample, for a fit of three parameters
 SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
 # locations that are tried at once, and how often the grid is refined around the best
 GRID, ROUNDS = 9, 9
@@ -80,7 +80,15 @@ def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
 
 
 def _status(outcome: Outcome | None, result: float | None) -> tuple[str, str | None]:
-    """Return a key of `STATUS`, and the reason why the run stopped early; None if it did not."""
+    """Return a key of `STATUS`, and the reason why the run stopped early; None if it did not.
+
+    Parameters
+    ----------
+    outcome
+        What the run of a sample gave; None if it has not been computed.
+    result
+        The result of the sample; None without.
+    """
     if outcome is None:
         return "missing", "not computed"
     reason = outcome.stopped
@@ -153,7 +161,8 @@ def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
         **moments(values),
         "weibull": _weibull(values),
         "level": LEVEL,
-        "intervals": intervals(values, seed, RESAMPLED)
+        # bootstrap intervals, of enough values
+        "intervals": intervals(values, seed, count=RESAMPLED)
         if len(values) >= MIN_SAMPLES_FOR_CORRELATION
         else {},
         "correlations": correlations(rows),
@@ -210,8 +219,8 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """
     from scipy.stats import pearsonr, spearmanr
 
-    # keys of single defects begin with one of these: the imperfections of one shell, and all
-    # sections that have a place (a.b.at.polar: a.b.)
+    # keys of single defects begin with one of these: "shell.imperfections." for one shell, else the
+    # section of any key that ends with a place ("a.b." of "a.b.at.polar")
     polar_key, keys = "at.polar", drawn_keys(rows)
     defect_prefixes = (
         "shell.imperfections.",
@@ -239,9 +248,9 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
-    """Return the change of the result by deleting the weakest defects; None without such results.
+    """Return the change of the result by deleting the weakest defects, as in summary.json.
 
-    It is over the samples that have both results.
+    It is over the samples that have both results; None if there are none.
     """
     value_pairs = [
         (row[RESULT], row[WITHOUT])
@@ -438,6 +447,7 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     counted = ", ".join(
         f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples"
     )
+    # heading, and the head of the table
     lines = [
         f"# {content['result']} of {content['case']}: {counts['samples']} random samples",
         "",
@@ -451,11 +461,14 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
         "| quantity | value | interval |",
         "| --- | --- | --- |",
     ]
+    # moments, and parameters of the Weibull distribution
     numbers = {key: content[key] for key in ("mean", "deviation", "least", "median", "largest")}
     lines += [_row(key, value, content["intervals"]) for key, value in numbers.items()]
     if weibull:
         names = ("shape", "location", "scale", "quantile_1_percent", "distance")
-        lines += [_row(key, weibull[key], content["intervals"], "Weibull, ") for key in names]
+        lines += [
+            _row(key, weibull[key], content["intervals"], prefix="Weibull, ") for key in names
+        ]
         if weibull["bounded"]:
             lines += [
                 "",
@@ -465,6 +478,7 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
             lines += ["determined by these samples."]
     else:
         lines += ["", "Too few different results for a Weibull distribution."]
+    # what not every ensemble has: correlations, a run without defects, samples without a result
     if content["correlations"]:
         lines += _lines_of_correlations(content)
     if without_weakest := content["without_weakest"]:
@@ -521,7 +535,7 @@ def _lines_of_samples_without_result(rows: Sequence[Row], table: str) -> list[st
 
 
 def _row(
-    key: str, value: float | None, intervals: dict[str, tuple[float, float]], suffix: str = ""
+    key: str, value: float | None, intervals: dict[str, tuple[float, float]], prefix: str = ""
 ) -> str:
     """Return a line of the table in report.md: name, value and interval of a number.
 
@@ -529,10 +543,10 @@ def _row(
     ----------
     intervals
         Name of a number -> its interval.
-    suffix
+    prefix
         Text before the name.
     """
     ends = intervals.get(key)
     value_text = "" if value is None else f"{value:.6g}"
     interval = f"{ends[0]:.5g} to {ends[1]:.5g}" if ends else ""
-    return f"| {suffix}{key.replace('_', ' ')} | {value_text} | {interval} |"
+    return f"| {prefix}{key.replace('_', ' ')} | {value_text} | {interval} |"

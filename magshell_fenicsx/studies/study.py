@@ -114,6 +114,7 @@ def study(  # noqa: PLR0913 - what a user gives
     with FOLDER.locked(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
+        # sources and mesh file of each point, whose measurements alone are used; and
         # (index of a point, number of ranks) -> file of its measurements
         files = {
             (i, rank_count): folder / "points" / f"{points[i].key}-{rank_count}.json"
@@ -149,6 +150,7 @@ def study(  # noqa: PLR0913 - what a user gives
 
         compute([*runs], point_measured, MPI.COMM_SELF, say)
         rows, reference_value = make_rows([*runs.values()], scalar, reference)
+        # of study.json
         content = {
             "case": Path(file).name,
             "settings": list(settings),
@@ -189,7 +191,7 @@ def parse_ranks(text: str) -> list[int]:
 
 
 def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
-    """Check the arguments of a study.
+    """Check the reference, the numbers of ranks and the number of repeated runs of a study.
 
     Raises
     ------

@@ -95,6 +95,7 @@ def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
         return None
 
     def mismatch(p: float) -> float:
+        """Return the difference of the equation's sides, multiplied by the denominators."""
         return float((v1 - v2) * (b**p - c**p) - (v2 - v3) * (a**p - b**p))
 
     low, high = ORDERS
@@ -139,6 +140,7 @@ class Run:
 
     @property
     def label(self) -> str:
+        """Values of the point and number of ranks, in words."""
         return f"{self.point.label}, {self.ranks} rank{'s' if self.ranks > 1 else ''}"
 
 
@@ -157,7 +159,7 @@ def make_rows(
         The reference; None takes the finest run, with an estimate of its error.
     """
     rows = [_row(run, scalar) for run in runs]
-    # finest: only if it is the reference itself
+    # the reference; and the row of the finest run if this run is the reference
     reference, finest = None, None
     if reference_value is not None:
         reference = Reference(reference_value, None, None, "given")
@@ -171,7 +173,7 @@ def make_rows(
         if reference and row["result"] is not None:
             # the finest run has the estimated error, not zero
             row["error"] = reference.error if row is finest else reference.error_of(row["result"])
-    # the Pareto front: runs with error and time that no other run beats
+    # the Pareto front: runs with an error and a time that no other run beats
     cost_column = clock(rows)
     comparable = [row for row in rows if row["error"] is not None and row[cost_column] is not None]
     for row in rows:
@@ -212,6 +214,7 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
 
     The error is extrapolated (Richardson) from runs that differ from it in the refinement alone.
     """
+    # keys in which the runs must agree with the finest one
     fixed_keys = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
     results_by_refinement = {
         run.point.case.mesh.refinement: row["result"]
@@ -413,7 +416,7 @@ def draw_study(
     for axes, (quantity, label) in zip(
         panels.flat, {cost_column: CLOCKS[cost_column], **AXIS_LABELS}.items(), strict=False
     ):
-        _errors(axes, series, quantity, own_error)
+        _draw_errors(axes, series, quantity, own_error)
         axes.set(xlabel=label, ylabel="relative error")
     _draw_phase_shares(panels[1, 1], series)
     figure.suptitle(title, fontsize=10)
@@ -439,7 +442,7 @@ def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     return series
 
 
-def _errors(
+def _draw_errors(
     axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None
 ) -> None:
     """Draw error over a quantity for each series, with double logarithmic axes.
@@ -453,9 +456,11 @@ def _errors(
     """
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+    # a line for each series
     for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
         x, error = ([row[key] for row in rows] for key in (quantity, "error"))
         axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
+    # the Pareto front as steps, with circles around its runs
     pareto_points = sorted(
         (row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"]
     )
@@ -481,7 +486,7 @@ def _errors(
             label="error of the reference itself",
         )
     axes.set(xscale="log", yscale="log")
-    # an axis around the geometric mean, not too short
+    # an axis around the geometric mean of least and largest value, not too short
     if values := [row[quantity] for rows in series.values() for row in rows]:
         middle = (min(values) * max(values)) ** 0.5
         half_range = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)

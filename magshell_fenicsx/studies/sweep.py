@@ -157,8 +157,9 @@ def sweep(  # noqa: PLR0913 - what a user gives
     requested = on_first_rank(comm, lambda: make_points(source, axes, make_case))
     share = share_of(part, len(requested))
     folder = FOLDER.prepare(user_folder(out), comm)
+    # points of earlier sweeps in the folder come first, then the requested ones
     points = access_disk(comm, lambda: with_earlier(folder, source, axes, requested, make_case))
-    earlier_count = len(points) - len(requested)  # points of earlier sweeps come first
+    earlier_count = len(points) - len(requested)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     # equal points are one: in reversed order the first number of a key is written last
     first = {point.key: number for number, point in reversed(list(enumerate(points)))}
@@ -168,11 +169,8 @@ def sweep(  # noqa: PLR0913 - what a user gives
     if part:
         missing = [number for number in missing if number - earlier_count in share]
     if comm.rank == 0:
-        earlier_text = f" and {earlier_count} there" if earlier_count else ""
-        say(
-            f"{len(requested)} points{earlier_text}, {len(missing)} to compute on {comm.size} "
-            f"rank{'s' * (comm.size > 1)}"
-        )
+        say(_line_at_begin(len(requested), earlier_count, len(missing), comm.size))
+        # a missing point has no usable outcome, but may have a file
         if known_count := sum(files[number].exists() for number in missing):
             say(
                 f"{known_count} of these computed again: their files are of other sources of "
@@ -202,17 +200,54 @@ def sweep(  # noqa: PLR0913 - what a user gives
         )
     if outcomes_of_points:
         access_disk(comm, lambda: _write(axes, outcomes_of_points, scalar, folder))
-    # the requested points of this part, without those of earlier sweeps
-    own_points = {id(point) for i, point in enumerate(requested) if not part or i in share}
-    requested_outcomes = [
-        (point, outcome) for point, outcome in outcomes_of_points if id(point) in own_points
+    own_points = [point for i, point in enumerate(requested) if not part or i in share]
+    return _sweep_of(axes, own_points, outcomes_of_points, scalar)
+
+
+def _line_at_begin(
+    requested_count: int, earlier_count: int, missing_count: int, rank_count: int
+) -> str:
+    """Return the line that says how many points there are, and how many are computed.
+
+    Parameters
+    ----------
+    requested_count, earlier_count, missing_count
+        Numbers of requested points, of further points of earlier sweeps, and of points without an
+        outcome.
+    """
+    earlier_text = f" and {earlier_count} there" if earlier_count else ""
+    return (
+        f"{requested_count} points{earlier_text}, {missing_count} to compute on {rank_count} "
+        f"rank{'s' * (rank_count > 1)}"
+    )
+
+
+def _sweep_of(
+    axes: list[Axis],
+    own_points: Sequence[SweepPoint],
+    outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]],
+    scalar: Scalar | None,
+) -> Sweep:
+    """Return the finished sweep of some points, without those of earlier sweeps.
+
+    Parameters
+    ----------
+    own_points
+        The requested points of this part.
+    outcomes_of_points
+        All points that have an outcome, with it.
+    scalar
+        The requested number; None without.
+    """
+    own_ids = {id(point) for point in own_points}
+    own_outcomes = [
+        (point, outcome) for point, outcome in outcomes_of_points if id(point) in own_ids
     ]
-    values = [outcome.value(scalar) for _, outcome in requested_outcomes] if scalar else []
     return Sweep(
-        axes,
-        [point for point, _ in requested_outcomes],
-        [outcome for _, outcome in requested_outcomes],
-        values,
+        axes=axes,
+        points=[point for point, _ in own_outcomes],
+        outcomes=[outcome for _, outcome in own_outcomes],
+        results=[outcome.value(scalar) for _, outcome in own_outcomes] if scalar else [],
     )
 
 
@@ -326,15 +361,18 @@ def _chains_of(
     links = [
         Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing
     ]
-    one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
-    followed = all(
+    # a fold is followed between cases that end at one; the state of a solid cannot be transferred
+    # to another mesh
+    one_mesh = key.startswith("magnetic.")
+    can_be_followed = all(
         has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in links
     )
-    if len(links) < 2 or not followed:
+    if len(links) < 2 or not can_be_followed:
         return [[link] for link in links]
-    common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
+    lowest_symmetry = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
     chain = [
-        replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in links
+        replace(link, case=link.case.model_copy(update={"symmetry": lowest_symmetry}))
+        for link in links
     ]
     return [sorted(chain, key=lambda link: link.at)]
 
@@ -355,6 +393,8 @@ class SweepCache:
     ----------
     columns
         Columns of path.csv that the outcomes of all runs keep.
+    scenes
+        The scenes that were used last.
     first
         Continuation from the first fold of the last chain. The first fold of the next chain is
         followed from it, if both have the same mesh.
@@ -370,6 +410,11 @@ def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
 
     The fold of a point is followed from the point before. Where this fails, the full path is
     computed.
+
+    Parameters
+    ----------
+    folds
+        Scenes and folds of the chains on this rank; it gets the first fold of this chain.
     """
     # None: there is no fold to follow, so the path is computed
     continuation = folds.first if len(chain) > 1 else None
@@ -399,6 +444,12 @@ def _by_fold(
 
     Parameters
     ----------
+    continuation
+        Follows the known fold.
+    link
+        The point.
+    folds
+        Gives the scene of the point.
     start
         Time at which the point was begun, of `time.perf_counter`.
     same_mesh
@@ -504,13 +555,16 @@ def with_earlier(
     """
     # for each earlier and each new point, its values on the axes as texts; tied keys have the same
     # value, so that the first one stands for the axis
-    keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
+    keys = [list(axis.keys) for axis in axes]
+    base = _base(source, axes)  # a hash of the case without the swept keys
     earlier = _earlier(folder, keys, base)
     new_values = [[point.values[axis.keys[0]] for axis in axes] for point in points]
-    # axes with all values, in whose units equal numbers in different units are found
+    # axes with the values of all points: their units make equal numbers of different units equal
     all_axes = [
-        Axis(axis.keys, tuple(v[i] for v in (*new_values, *earlier))) for i, axis in enumerate(axes)
+        Axis(axis.keys, tuple(values[i] for values in (*new_values, *earlier)))
+        for i, axis in enumerate(axes)
     ]
+    # a place is a text for each axis, the same for equal numbers
     new_places = {_place(values, all_axes) for values in new_values}
     earlier_only = [values for values in earlier if _place(values, all_axes) not in new_places]
     if (count := len(earlier_only) + len(new_values)) > MOST_POINTS:
@@ -579,6 +633,7 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
         len(values) != len(stored_sweep.keys) for values in stored_sweep.points
     ):
         raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
+    # it must be over the same keys, and of the same case
     if stored_sweep.keys != keys:
         keys_text = " and ".join("+".join(axis_keys) for axis_keys in stored_sweep.keys)
         raise CaseError(
@@ -614,18 +669,44 @@ def _write(
 ) -> None:
     """Write sweep.csv, curves.csv and the picture.
 
-    In sweep.csv values with units are columns of numbers too, and so are the results of a case with
-    units.
-
     Parameters
     ----------
+    outcomes_of_points
+        Each point with its outcome.
     scalar
         The requested number; None without.
     """
     points = [point for point, _ in outcomes_of_points]
     outcomes = [outcome for _, outcome in outcomes_of_points]
-    swept = tuple(points[0].values)
-    # sweep.csv: a row for each point
+    results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
+    _write_points(axes, outcomes_of_points, results, folder / TABLE)
+    _write_curves(outcomes_of_points, folder / CURVES)
+    draw_sweep(
+        axes,
+        points,
+        outcomes,
+        folder / PICTURE,
+        requested=(scalar.name, results) if scalar and results else None,
+    )
+
+
+def _write_points(
+    axes: Sequence[Axis],
+    outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]],
+    results: Sequence[float | None] | None,
+    file: Path,
+) -> None:
+    """Write sweep.csv, a row for each point.
+
+    Values with units are columns of numbers too, and so are the results of a case with units.
+
+    Parameters
+    ----------
+    outcomes_of_points
+        Each point with its outcome.
+    results
+        The requested number at each point; None if none was requested.
+    """
     rows = [
         {
             **point.values,
@@ -636,15 +717,16 @@ def _write(
         }
         for point, outcome in outcomes_of_points
     ]
-    results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
+    # with the requested number, if there is one
     rows = (
         [row | {"result": value} for row, value in zip(rows, results, strict=True)]
         if results
         else rows
     )
     # order of the first columns; others follow as rows have them
-    first = (
-        *swept,
+    first_point, _ = outcomes_of_points[0]
+    first_columns = (
+        *first_point.values,
         "k_d",
         *OF_LIMIT,
         "stopped",
@@ -655,35 +737,36 @@ def _write(
         "point",
         "barrier",
     )
-    write_csv(
-        rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE
-    )
-    # curves.csv: a line for each point of each path
+    all_columns = dict.fromkeys((*first_columns, *(key for row in rows for key in row)))
+    write_csv(rows, tuple(all_columns), file)
+
+
+def _write_curves(outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]], file: Path) -> None:
+    """Write curves.csv, a line for each point of each path, with the swept values."""
     lines = [
         {**point.values, **row} for point, outcome in outcomes_of_points for row in outcome.curve
     ]
-    curves = [key for key in CURVE if any(key in line for line in lines)]
-    axis_columns = [key for line in lines for key in line if key not in COLUMNS]  # of scenes, too
-    write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *axis_columns))), folder / CURVES)
-    draw_sweep(
-        axes,
-        points,
-        outcomes,
-        folder / PICTURE,
-        (scalar.name, results) if scalar and results else None,
-    )
+    first_point, _ = outcomes_of_points[0]
+    columns_of_curves = [key for key in CURVE if any(key in line for line in lines)]
+    # swept keys, and columns that scenes add
+    further_columns = [key for line in lines for key in line if key not in COLUMNS]
+    all_columns = dict.fromkeys((*first_point.values, *columns_of_curves, *further_columns))
+    write_csv(lines, tuple(all_columns), file)
 
 
 def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:
     """Return `key_unit` -> number, for the values of a point that have units."""
-    swept = [(axis, key) for axis in axes if axis.unit and axis.numbers for key in axis.keys]
-    return {f"{key}_{axis.unit}": axis.number(point.values[key]) for axis, key in swept}
+    axes_and_keys = [
+        (axis, key) for axis in axes if axis.unit and axis.numbers for key in axis.keys
+    ]
+    return {f"{key}_{axis.unit}": axis.number(point.values[key]) for axis, key in axes_and_keys}
 
 
 def _in_units(outcome: Outcome) -> dict[str, Any]:
     """Return the columns with units of the limit point, and the numbers of the case with units."""
-    units, limit = tuple(f"_{ending}" for ending in endings()), outcome.limit or {}
-    return {key: v for key, v in limit.items() if key.endswith(units)} | outcome.in_units
+    # endings of names that have a unit, such as "_mm"
+    unit_endings, limit = tuple(f"_{ending}" for ending in endings()), outcome.limit or {}
+    return {key: v for key, v in limit.items() if key.endswith(unit_endings)} | outcome.in_units
 
 
 def sweep_row(outcome: Outcome) -> Mapping[str, Any]:

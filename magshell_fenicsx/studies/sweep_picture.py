@@ -91,7 +91,7 @@ def draw_sweep(
         _values(plot, axes, points, results)
     else:
         _curves(plot, points, outcomes)
-    plot.set_title(_fixed(axes, points), fontsize=9)
+    plot.set_title(_common_numbers(points), fontsize=9)
     labels = plot.get_legend_handles_labels()[1]
     if labels and any(labels):
         columns = -(-len(labels) // LEGEND_ROWS)  # rounded up
@@ -100,7 +100,7 @@ def draw_sweep(
     plt.close(figure)
 
 
-def _fixed(axes: Sequence[Axis], points: Sequence[SweepPoint]) -> str:
+def _common_numbers(points: Sequence[SweepPoint]) -> str:
     """Return R/h and Poisson's ratio as text, if all points have the same."""
     texts = []
     for symbol, values in (
@@ -124,17 +124,20 @@ def _results(
 
     Barriers and knockdowns have a second scale if all points share its units.
     """
-    if requested and requested[0] not in ("knockdown", "barrier"):
-        return Results(requested[1], requested[0])
-    # second scales: the units of energy and pressure in millijoule and pascal
+    if requested:
+        name, values = requested
+        if name not in ("knockdown", "barrier"):
+            return Results(values, label=name)
     barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
+    # second scales: the units of energy and pressure in millijoule and pascal
     if any(value is not None for value in barriers):
-        return Results(
-            barriers, BARRIER, _common(outcomes, "unit_energy_mJ"), "energy barrier  (mJ)"
-        )
+        energy_unit = _common(outcomes, "unit_energy_mJ")
+        return Results(barriers, BARRIER, size=energy_unit, measured="energy barrier  (mJ)")
     if any(value is not None for value in knockdowns):
-        size = _common(outcomes, "classical_pressure_Pa")
-        return Results(knockdowns, KNOCKDOWN, size, "buckling pressure  (Pa)")
+        pressure_unit = _common(outcomes, "classical_pressure_Pa")
+        return Results(
+            knockdowns, KNOCKDOWN, size=pressure_unit, measured="buckling pressure  (Pa)"
+        )
     return None
 
 
@@ -147,8 +150,8 @@ def _common(outcomes: Sequence[Outcome], name: str) -> float:
 def _ends(outcomes: Sequence[Outcome]) -> Results:
     """Return the last load of each curve; the last displacement if all loads are the same."""
     last_rows = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
-    last_row = next((row for row in last_rows if row), {})
-    # displacement x and load y of the last amplitude
+    last_row = next((row for row in last_rows if row), {})  # of the first point with a curve
+    # quantities on the axes of a curve: displacement x and load y of the last amplitude
     x, y = axes_of(str(last_row.get("amplitude", "")) or "force", last_row)
     loads_differ = np.ptp([y.on_axis(row) for row in last_rows if y.name in row]) > 0
     drawn_quantity = y if loads_differ else x
@@ -186,12 +189,12 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
         plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
     # dots where there is a result, crosses where it is missing
-    for is_hidden, style in (
-        (False, {"marker": ".", "color": "0.15"}),
-        (True, {"marker": "x", "color": "0.5"}),
+    for with_result, style in (
+        (True, {"marker": ".", "color": "0.15"}),
+        (False, {"marker": "x", "color": "0.5"}),
     ):
         plot.plot(
-            *places[is_missing == is_hidden].T,
+            *places[is_missing != with_result].T,
             linestyle="",
             markersize=4,
             clip_on=False,
@@ -276,6 +279,7 @@ def _axis_label(axis: Axis) -> str:
 def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
     """Draw the last varied load over its displacement, a curve for every point of the sweep."""
     amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
+    # quantities on the axes: displacement and load, in units if the rows have them
     x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         rows = loaded(outcome.curve, amplitude)

@@ -18,7 +18,7 @@ STEP = 1e-5
 
 @pytest.mark.parametrize("mu", [{"a": 0.0, "b": 0.0, "c": 0.0}, {"a": 0.7, "b": -1.3, "c": 2.0}])
 def test_derivatives(mu: dict[str, float]) -> None:
-    """Central differences of the places and of their first derivatives, in all pairs of amplitudes."""
+    """Central differences of the places and their first derivatives, in all pairs of amplitudes."""
     here = apply_motions(MOTIONS, mu, X)
     for name in mu:
         low, high = (

@@ -58,7 +58,8 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
     case = Case.load(
         file,
         [
-            "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.32 mm, youngs_modulus: 1.8 MPa, "
+            "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.32 mm, "
+            "youngs_modulus: 1.8 MPa, "
             "poisson_ratio: 0.5}",
             "magnetic={remanent: {flux_density: 60 mT}, applied: {flux_density: 0.05 T}}",
         ],
@@ -97,12 +98,18 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
         ("magnetic.remanent={kind: patches, patches: {dimple: {}}}", "needs the patch rest"),
         ("magnetic.remanent={kind: layers, layers: [{fraction: 0.5}]}", "add up to 1"),
         (
-            "magnetic.remanent={kind: layers, layers: [{fraction: 0.5}, {fraction: 0.5, polar: 180}]}",
+            (
+                "magnetic.remanent={kind: layers, "
+                "layers: [{fraction: 0.5}, {fraction: 0.5, polar: 180}]}"
+            ),
             "remanence of length zero",
         ),
         ("magnetic.applied.gradient=[[1, 0], [0, 1], [0, 0]]", "three rows of three"),
         (
-            "magnetic={lambda_m: 1, energy: first, applied: {gradient: [[1,0,0],[0,0,0],[0,0,-1]]}}",
+            (
+                "magnetic={lambda_m: 1, energy: first, "
+                "applied: {gradient: [[1,0,0],[0,0,0],[0,0,-1]]}}"
+            ),
             "energy: full",
         ),
         ("loading={kind: field, control: load, until: points}", "goes with control: arc"),

@@ -22,7 +22,8 @@ magnetic:
   remanent: {flux_density: 60 mT}
   applied:
     sources:
-      - {kind: cylinder, diameter: 10 mm, height: 10 mm, polarization: 1.2 T, position: [0, 0, -60 mm]}
+      - {kind: cylinder, diameter: 10 mm, height: 10 mm, polarization: 1.2 T, \
+position: [0, 0, -60 mm]}
 loading: {kind: pressure, control: arc, until: target, pressure: 100 Pa}
 """
 MAGNET = "magnetic.applied.sources.0"
@@ -89,7 +90,10 @@ MISTAKES = [
     ),
     (
         "loading={kind: pressure, control: volume, until: target, pressure: 100 Pa}",
-        "loading: until: target with control: volume needs volume_change (and nothing else) as target; control: arc",
+        (
+            "loading: until: target with control: volume needs volume_change (and nothing else) "
+            "as target; control: arc"
+        ),
     ),
 ]
 

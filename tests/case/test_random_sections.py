@@ -1,4 +1,4 @@
-"""Distributions against SciPy's, random places against the area of the sphere, and what is refused."""
+"""Distributions against SciPy's, random places against the sphere's area, what is refused."""
 
 import json
 from itertools import combinations

@@ -65,18 +65,39 @@ def test_every_case_fits(committed: Draft202012Validator, file: Any) -> None:
 @pytest.mark.parametrize(
     "setting",
     [
-        "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.32mm, youngs_modulus: 1.8 MPa, poisson_ratio: 0.5}",
+        (
+            "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.32mm, "
+            "youngs_modulus: 1.8 MPa, poisson_ratio: 0.5}"
+        ),
         "shell={geometry: disc, radius: 1.5e-2 * m, thickness: .2 mm, poisson_ratio: 0}",
         f"shell={{geometry: plate, {LENGTHS}, poisson_ratio: 0.3, thickness_factor: 1 + x}}",
-        "shell={geometry: mesh, file: a.msh, radius: 1 m, unit: mm, thickness: 2 µm, poisson_ratio: 0}",
-        "shell={geometry: mesh, file: a.msh, radius: 1, thickness: 0.01, poisson_ratio: 0, thickness_factor: {a: 2}}",
-        "shell={geometry: revolution, profile: {radius: 1 + z, heights: [0, 1]}, thickness: 0.01, poisson_ratio: 0}",
+        (
+            "shell={geometry: mesh, file: a.msh, radius: 1 m, unit: mm, thickness: 2 µm, "
+            "poisson_ratio: 0}"
+        ),
+        (
+            "shell={geometry: mesh, file: a.msh, radius: 1, thickness: 0.01, poisson_ratio: 0, "
+            "thickness_factor: {a: 2}}"
+        ),
+        (
+            "shell={geometry: revolution, profile: {radius: 1 + z, heights: [0, 1]}, "
+            "thickness: 0.01, poisson_ratio: 0}"
+        ),
         "boundary={equator: clamped}",
         "boundary={rim: {held: [x, z]}, left: symmetry, top: simply supported}",
         "magnetic={lambda_m: 1, remanent: {kind: expression, components: [x, '0', z**2]}}",
-        "magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 5 T, gradient: [[1,0,0],[0,1,0],[0,0,-2]]}}",
-        "magnetic={lambda_m: 1, remanent: {kind: layers, layers: [{fraction: 0.5}, {fraction: 0.5, polar: 9}]}}",
-        "loading={kind: dead, loads: [{at: A, force: [1, 0, 0]}, {over: all, pressure: 2}], factor: 1}",
+        (
+            "magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 5 T, "
+            "gradient: [[1,0,0],[0,1,0],[0,0,-2]]}}"
+        ),
+        (
+            "magnetic={lambda_m: 1, remanent: {kind: layers, "
+            "layers: [{fraction: 0.5}, {fraction: 0.5, polar: 9}]}}"
+        ),
+        (
+            "loading={kind: dead, loads: [{at: A, force: [1, 0, 0]}, {over: all, pressure: 2}], "
+            "factor: 1}"
+        ),
         "loading={kind: rotation, to: {polar: 90}}",
         "shell.defect=null",
     ],

@@ -14,7 +14,10 @@ WIDTH = R / sqrt(sqrt(12 * (1 - NU**2)) * R / H)  # mm: the width 1
 SPHERE = f"geometry: hemisphere, radius: {R} mm, thickness: {H} mm, poisson_ratio: {NU}"
 CAP = f"geometry: cap, radius: {R} mm, thickness: {H} mm, poisson_ratio: {NU}, polar: 60"
 BARE = SPHERE.replace(f"radius: {R} mm, thickness: {H} mm", "radius_to_thickness: 90")
-DRAWN = "{kind: random, seed: 1, dimples: {count: 2, amplitude: AMPLITUDE, width: 2, polar: [0, 40], distance: 25}}"
+DRAWN = (
+    "{kind: random, seed: 1, dimples: {count: 2, amplitude: AMPLITUDE, width: 2, polar: [0, 40], "
+    "distance: 25}}"
+)
 
 
 def loaded(shell: str, imperfection: str) -> list[ImperfectionSection]:
@@ -101,7 +104,10 @@ def test_the_same_numbers(shell: str, written: str, number: str) -> None:
         (
             BARE,
             DRAWN.replace("AMPLITUDE", "{kind: normal, mean: 1, deviation: 0.1, unit: mm}"),
-            "shell.imperfections.0: dimples: amplitude: has a unit: that needs lengths of the shell with units",
+            (
+                "shell.imperfections.0: dimples: amplitude: has a unit: that needs lengths of the "
+                "shell with units"
+            ),
         ),
     ],
 )

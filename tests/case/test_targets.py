@@ -1,4 +1,4 @@
-"""Targets with units against the same as numbers; the sizes are those of docs/theory.md, by hand."""
+"""Targets with units against the same as numbers. The sizes are of docs/theory.md, by hand."""
 
 from math import pi, sqrt
 from typing import Any

@@ -123,7 +123,7 @@ def test_pieces_of_an_iteration() -> None:
 
 @pytest.mark.slow
 def test_cold_kernels_are_compiled() -> None:
-    """The meridian's, in an empty cache: seconds, where they take a tenth of one from a full cache."""
+    """The meridian's take seconds in an empty cache, and a tenth of one in a full cache."""
     settings = ("mesh.refinement=0.5", "mesh.degree=3")
     cold = measure_item(Item("kernels", "dimple_buckling", settings, repeat=1, cold=True))
     warm = measure_item(Item("kernels", "dimple_buckling", settings, repeat=1))

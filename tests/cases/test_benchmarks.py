@@ -103,7 +103,10 @@ def test_curve(file: str, settings: list[str], most: float) -> None:
 
 @SLOW
 def test_pulled_out_cylinder() -> None:
-    """B and C to 0.5 %; under the force itself a Koiter shell gives 1.6 % less (docs/benchmarks)."""
+    """B and C to 0.5 %.
+
+    Under the force itself a Koiter shell gives 1.6 % less (docs/benchmarks).
+    """
     found = distances("cylinder_pullout.yaml", "loading.points=10")
     assert found["minus_u_B"] < 5e-3
     assert found["minus_u_C"] < 5e-3

@@ -84,8 +84,9 @@ def test_dimple_buckling(
 
 
 def test_bistable_dome() -> None:
-    """Snap in at a fold, that of the half shell within its mesh; back at a bifurcation with two waves.
+    """It snaps in at a fold, that of the half shell within its mesh.
 
+    It snaps back at a bifurcation with two waves.
     The numbers are those of README.
     """
     found = result("bistable_dome.yaml")
@@ -283,7 +284,7 @@ def test_cap_waves_branch() -> None:
 
 @pytest.mark.slow
 def test_bracket() -> None:
-    """w = F b^2 (a + b/3)/(E I) (Bernoulli): the fold of the mesh is part of the undeformed shape."""
+    """w = F b^2 (a + b/3)/(E I) (Bernoulli). The mesh's fold is part of the undeformed shape."""
     found = result("bracket.yaml")
     E_I, F = 0.4 * 0.01**3 / 12, 2.5e-12
     assert found.rows[-1]["tip_uz"] == pytest.approx(-F * (1 + 1 / 3) / E_I, rel=1e-3)
@@ -343,7 +344,7 @@ def test_gripper() -> None:
 
 @pytest.mark.slow
 def test_turning_field_ends_where_the_tilted_one_does() -> None:
-    """Turning the field from 150 to 90 degrees and applying it at 90 degrees give the same strip."""
+    """Turning the field from 150 to 90 degrees, and applying it at 90, give the same strip."""
     turning = "loading={kind: rotation, to: {polar: 0}, points: 4}"
     found = result("magnetic_strip.yaml", "magnetic.applied.polar=-60", turning)
     straight = result("magnetic_strip.yaml", "magnetic.applied.polar=0.0")
@@ -369,7 +370,10 @@ def test_strip_against_its_field_buckles() -> None:
 
 @pytest.mark.slow
 def test_solid_buckling() -> None:
-    """The axisymmetric shell's k_d; the solid's is above it, 0.8 % (docs/solid) and 0.4 % of mesh."""
+    """The axisymmetric shell's k_d. The solid's is above it.
+
+    That is 0.8 % (docs/solid), and 0.4 % of mesh.
+    """
     found = result("solid_buckling.yaml", "magnetic.lambda_m=0.00184", "mesh.refinement=0.5")
     assert found.knockdown is not None
     assert 0.005 < found.knockdown / 0.552053778 - 1 < 0.018

@@ -82,7 +82,7 @@ def test_hard_plate() -> None:
 
 @pytest.mark.slow
 def test_stiffness() -> None:
-    """Over four decades of it the force changes by less than 1e-3, with penetrations below 1e-3 h."""
+    """Over four decades of it the force changes by less than 1e-3. Penetrations: below 1e-3 h."""
     found = [
         last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e8")
     ]
@@ -206,7 +206,8 @@ def test_force_control_and_a_held_force(tmp_path: Path) -> None:
     """
     steps = (
         "[{kind: contact, control: force, force: 1, points: 1},"
-        " {kind: pressure, control: load, until: target, pressure: 0.1, points: 1, hold: {approach: conjugate}},"
+        " {kind: pressure, control: load, until: target, pressure: 0.1, points: 1, "
+        "hold: {approach: conjugate}},"
         " {kind: contact, approach: -0.1, points: 1}]"
     )
     out = tmp_path / "out"

@@ -13,7 +13,7 @@ from magshell_fenicsx import Case
     [pytest.param("clamped", 8e-3, 2e-4, marks=pytest.mark.slow), ("free", 2e-4, 2e-5)],
 )
 def test_triangles_and_meridian(edge: Edge, coarse: float, fine: float) -> None:
-    """The energy of "hyperboloid.yaml" at R/h = 100 on two meshes, against waves on the meridian."""
+    """The energy of "hyperboloid.yaml" at R/h = 100 on two meshes, against the meridian's waves."""
     assert Case.load(CASE).symmetry == "auto"
     exact = reference(edge, 100)
     for size, error in ((0.4, coarse), (0.2, fine)):

@@ -10,7 +10,10 @@ from magshell_fenicsx.public import Scene, run
 
 # of the paper's dimple at the pole; an independent solver of the meridian's equations, nine digits
 POLAR = 0.326233289
-ONE = "shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2, at: {polar: 40, azimuth: 25}}]"
+ONE = (
+    "shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2, "
+    "at: {polar: 40, azimuth: 25}}]"
+)
 
 
 def knockdown(file: str, *settings: str) -> float:
@@ -29,7 +32,7 @@ def test_a_dimple_far_from_the_edge_is_as_at_the_pole() -> None:
 
 @pytest.mark.slow
 def test_two_dimples() -> None:
-    """Own value on a mesh 1.5 times as fine as the default; alone, the one at the pole has 0.326."""
+    """Own value on a mesh 1.5 times as fine as the default. The one at the pole alone has 0.326."""
     assert knockdown("two_dimples.yaml", "mesh.refinement=0.5") == pytest.approx(0.30881, rel=5e-4)
 
 

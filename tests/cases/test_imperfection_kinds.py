@@ -17,7 +17,8 @@ shell:
     - {kind: modes, amplitudes: [0.1, 0.05]}
     - {kind: random, seed: 1, amplitude: 0.05, length: 4}
     - {kind: data, file: scan.csv, amplitude: 0.5}
-    - {kind: random, seed: 2, dimples: {count: 2, amplitude: 0.3, width: 3, polar: [10, 60], distance: 30}}
+    - {kind: random, seed: 2, dimples: {count: 2, amplitude: 0.3, width: 3, polar: [10, 60], \
+distance: 30}}
 boundary: {equator: clamped}
 loading: {kind: pressure, control: load, until: target, pressure: 0.1}
 mesh: {degree: 2, size: 0.4}

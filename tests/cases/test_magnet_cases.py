@@ -164,7 +164,7 @@ def test_magnet_stack() -> None:
 
 @pytest.mark.slow
 def test_the_interaction_decides_the_order_of_a_stack(tmp_path: Path) -> None:
-    """The upper cap, 1.5 % thinner, snaps first at a load as h²; with the interaction the lowest."""
+    """The upper cap, 1.5 % thinner, snaps first, at a load as h². With interaction the lowest."""
     thinner = "shell.thickness_factor={upper: 0.985}"
     case = yaml.safe_load((CASES / "magnet_stack.yaml").read_text())
     del case["magnetic"]

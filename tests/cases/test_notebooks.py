@@ -1,4 +1,4 @@
-"""The examples in cases/notebooks run as scripts; one number of each, and what it is compared with."""
+"""The examples in cases/notebooks run as scripts: one number of each, and its comparison."""
 
 import io
 import re

@@ -54,7 +54,8 @@ def elastica() -> dict[str, float]:
     assert cKDTree(lower.T).query(upper.T)[0].min() > (1 - 1e-6) * h  # they touch nowhere else
     x, z_tip = lower[:, -1]
     return {
-        "lower_x": x, "lower_z": z_tip, "upper_x": CLAMP - x, "upper_z": (1 + GAP) * h - DOWN - z_tip,
+        "lower_x": x, "lower_z": z_tip, "upper_x": CLAMP - x,
+        "upper_z": (1 + GAP) * h - DOWN - z_tip,
         "force": F, "clamp_x": -F * np.sin(at), "clamp_z": F * np.cos(at), "moment": z[3, 0],
     }  # fmt: skip
 
@@ -95,7 +96,8 @@ def test_two_cantilevers() -> None:
     D = h**3 / 12
     tips = {
         "lower_x": 1 + seen["lower_tip_ux"], "lower_z": seen["lower_tip_uz"],
-        "upper_x": CLAMP - 1 + seen["upper_tip_ux"], "upper_z": (1 + GAP) * h + seen["upper_tip_uz"],
+        "upper_x": CLAMP - 1 + seen["upper_tip_ux"],
+        "upper_z": (1 + GAP) * h + seen["upper_tip_uz"],
     }  # fmt: skip
     forces = {
         "force": 2 * np.pi * seen["contact_force"] / WIDTH,
@@ -120,7 +122,8 @@ def test_strips_that_meet_flat() -> None:
     }
     upper = {"boundary": {"right": "clamped"}, "place": {"position": [0, 0, (1 + gap) * h]}}
     case = {
-        "shells": {"lower": {"shell": strip, "boundary": {"left": "clamped"}}, "upper": {"shell": strip, **upper}},
+        "shells": {"lower": {"shell": strip, "boundary": {"left": "clamped"}},
+                   "upper": {"shell": strip, **upper}},
         "contact": [["upper", "lower"]],
         "mesh": {"degree": 3, "size": 0.2},
         "loading": {

@@ -1,4 +1,4 @@
-"""The cases with programmes run, and their numbers agree with what follows from energy and order."""
+"""The cases with programmes run. Their numbers agree with what energy and order imply."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,10 @@ def test_programme() -> None:
     before = [row for row in rows if row["step"] == 2][-1]
     assert sealed == pytest.approx([before["volume_change"]] * len(sealed), rel=1e-7)
     last = rows[-1]
-    pressure = f"loading={{kind: pressure, control: load, until: target, pressure: {last['p_over_pc']}, points: 1}}"
+    pressure = (
+        "loading={kind: pressure, control: load, until: target, "
+        f"pressure: {last['p_over_pc']}, points: 1}}"
+    )
     alone = run(
         Case.load(CASES / "programme.yaml", ["mesh.refinement=0.5", "magnetic=null", pressure])
     ).rows[-1]

@@ -239,7 +239,8 @@ def written(
 CORNERS = [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
 FRAME = [[0, 1], [1, 2], [2, 3], [3, 0]]
 TWO = [[0, 1, 2], [0, 2, 3]]
-STRIP = [[np.cos(t) * (1 + s * np.cos(t / 2) / 2), np.sin(t) * (1 + s * np.cos(t / 2) / 2), s * np.sin(t / 2) / 2]
+STRIP = [[np.cos(t) * (1 + s * np.cos(t / 2) / 2), np.sin(t) * (1 + s * np.cos(t / 2) / 2),
+          s * np.sin(t / 2) / 2]
          for t in np.linspace(0, 2 * np.pi, 12, endpoint=False) for s in (-1, 1)]  # fmt: skip
 MOEBIUS = [
     cell
@@ -252,7 +253,10 @@ WRONG = [
         TWO,
         CORNERS,
         FRAME[:3],
-        r"shell.file: the surface ends at the edge around \(0, 0.5, 0\), which belongs to no physical curve",
+        (
+            r"shell.file: the surface ends at the edge around \(0, 0.5, 0\), "
+            r"which belongs to no physical curve"
+        ),
     ),
     (
         [[0, 1, 2], [4, 5, 3]],
@@ -365,7 +369,10 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
     for changed, said in (
         (
             {"boundary": {"rim": "clamped"}},
-            "boundary.rim: the surface has no such edge, only bottom, left, lower, right, top, upper",
+            (
+                "boundary.rim: the surface has no such edge, only bottom, left, lower, "
+                "right, top, upper"
+            ),
         ),
         (
             {"boundary": {"top": "hinged"}, "shell": {**shell, "thickness_factor": {"front": 2}}},
@@ -427,7 +434,8 @@ def test_unknown_patches_are_refused_when_checked(model: Any, tmp_path: Path) ->
 
 
 CASE_FILE = """
-shell: {geometry: mesh, file: parts/part.msh, radius: 1, thickness: 0.02, youngs_modulus: 1, poisson_ratio: 0.3}
+shell: {geometry: mesh, file: parts/part.msh, radius: 1, thickness: 0.02, youngs_modulus: 1, \
+poisson_ratio: 0.3}
 boundary: {rim: clamped}
 loading: {kind: dead, control: load, loads: [{over: all, pressure: 1e-9}], factor: 1, points: 1}
 mesh: {degree: 2}

@@ -16,7 +16,8 @@ first = 11 * i + j
 lower, upper = [first, first + 1, first + 12], [first, first + 12, first + 11]
 cells = np.concatenate([np.column_stack(lower), np.column_stack(upper)])
 x = np.array([(i, j, 0.0) for i in range(21) for j in range(11)])
-element, comm, numberings = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)), MPI.COMM_WORLD, set()
+element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
+comm, numberings = MPI.COMM_WORLD, set()
 for _ in range(40):
     domain = create_mesh(comm, element, cells, x)
     V = fem.functionspace(domain, ("Lagrange", 2))

@@ -127,7 +127,7 @@ def test_a_point_beside_an_edge_is_on_it(
 
 
 def test_elements_are_no_wider_than_the_shape() -> None:
-    """A point in the middle of a narrow strip's end is not beside its sides, whatever `mesh.size`."""
+    """A point mid-way on a narrow strip's end is not beside its sides, whatever `mesh.size`."""
     strip = {"geometry": "strip", "width": 0.2, "radius_to_thickness": 50, "poisson_ratio": 0}
     patch = meshed(strip, {"A": [0.5, 0.05, 0]}, size=10)
     assert patch.points["A"] == pytest.approx([0.5, 0.05], abs=1e-12)

@@ -29,7 +29,8 @@ KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "varying thickness": (
         {"plate": {"kind": "plane", "at": {"point": [0, 0.1, 0]}, "stiffness": 1e3}},
-        {"shell": {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.02, "youngs_modulus": 1,
+        {"shell": {"geometry": "plate", "length": 1, "width": 0.2, "thickness": 0.02,
+                   "youngs_modulus": 1,
                    "poisson_ratio": 0.3, "thickness_factor": "1 - x/2"},
          "boundary": {"left": "clamped"}, "symmetry": "none", "mesh": {"degree": 3, "size": 0.2}},
     ),
@@ -143,7 +144,7 @@ def disc_on_ball(w0: float, bend: float) -> tuple[float, float]:
 
 
 def test_disc_against_plate_theory() -> None:
-    """A ball so large that a flat disc rests on a ring of it: force and radius of the ring, 2e-3."""
+    """A ball so large that a flat disc rests on a ring of it: the ring's force and radius, 2e-3."""
     h, bend = 1 / 100, 1.2e-3
     data = {
         "shell": {"geometry": "disc", "radius_to_thickness": 1 / h, "poisson_ratio": 0.3},

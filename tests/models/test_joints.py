@@ -35,7 +35,7 @@ def plate(position: list[float], polar: float = 0.0, **keys: Any) -> dict[str, A
 
 
 def deflected(joint: dict[str, Any], gap: float = 0.0) -> float:
-    """Of the joint of two plates under a weight of 1e-8 on the first; their triangles do not meet."""
+    """Of the joint of two plates, a weight of 1e-8 on the first. Their triangles do not meet."""
     left = plate([0, 0, 0], boundary={"left": "clamped"}, points={"tip": [1, 0.125, 0]})
     right = plate([1 + gap, 0, 0], boundary={"right": {"held": ["y", "z"]}}, mesh={"size": 0.1})
     loads = [{"over": "left", "per_area": [0, 0, -1e-8]}]
@@ -75,7 +75,8 @@ def test_unlike_materials() -> None:
         "shells": {"left": left, "right": right},
         "joints": [{"edges": ["left.right", "right.left"]}],
         "mesh": {"degree": 3, "size": 0.25},
-        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "right.right", "force": [0, 0, -1e-9]}],
+        "loading": {"kind": "dead", "control": "load",
+                    "loads": [{"edge": "right.right", "force": [0, 0, -1e-9]}],
                     "factor": 1, "points": 1},
     }  # fmt: skip
     scene = Scene(Case.from_source(data))
@@ -99,7 +100,8 @@ def test_angle_of_a_crease() -> None:
     )
     data = {
         "shells": {"left": left, "right": right},
-        "joints": [{"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 0.01 * D, "angle": -angle}],
+        "joints": [{"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": 0.01 * D,
+                    "angle": -angle}],
         "mesh": {"degree": 3, "size": 0.5},
         "loading": {"kind": "dead", "control": "load", "factor": 1, "points": 1,
                     "loads": [{"edge": "right.right", "force": [-1e-12, 0, 0]}]},
@@ -200,9 +202,12 @@ LINE = {
     ("setting", "message"),
     [
         ("loading.loads.0.edge=beam.right", "beam.right: is joined, by joints.0, and no edge of"),
-        ("loading.loads.0.edge=beam.nowhere", "loading.loads: edge: beam.nowhere: the surface has only arm."),
-        ("loading.loads=[{at: arm.tap, force: [0, 0, 1]}]", "arm.tap: name it in points, with its place; there are"),
-        ("shells.beam.boundary.right=clamped", "shells.beam.boundary.right: is joined, by joints.0, and no edge"),
+        ("loading.loads.0.edge=beam.nowhere",
+         "loading.loads: edge: beam.nowhere: the surface has only arm."),
+        ("loading.loads=[{at: arm.tap, force: [0, 0, 1]}]",
+         "arm.tap: name it in points, with its place; there are"),
+        ("shells.beam.boundary.right=clamped",
+         "shells.beam.boundary.right: is joined, by joints.0, and no edge"),
     ],
 )  # fmt: skip
 def test_names_in_messages_are_those_of_the_case(

@@ -75,14 +75,18 @@ def made(shell: dict[str, Any], boundary: dict[str, str], **sections: Any) -> Sc
 
 
 KINDS = {
-    "shell": lambda: made(PLATE, {"left": "clamped"}, magnetic=field([ASIDE, COIL], flux_density="20 mT", polar=30),
+    "shell": lambda: made(PLATE, {"left": "clamped"},
+                          magnetic=field([ASIDE, COIL], flux_density="20 mT", polar=30),
                           loading=STEPS, mesh={"degree": 3, "size": 0.03}),
-    "rotation law": lambda: made(PLATE, {"left": "clamped"}, loading=STEPS, mesh={"degree": 2, "size": 0.03},
+    "rotation law": lambda: made(PLATE, {"left": "clamped"}, loading=STEPS,
+                                 mesh={"degree": 2, "size": 0.03},
                                  magnetic={**field([ASIDE, COIL]), "remanence": "rotation"}),
     "meridian": lambda: made(RING, {"inner": "clamped"}, symmetry="axisymmetric",
-                             magnetic={**field([BELOW]), "remanent": {"kind": "radial", "flux_density": "100 mT"}},
+                             magnetic={**field([BELOW]),
+                                       "remanent": {"kind": "radial", "flux_density": "100 mT"}},
                              loading=UP),
-    "solid": lambda: made(PLATE, {"left": "clamped"}, model="solid", magnetic=field([ASIDE, COIL]), loading=STEPS,
+    "solid": lambda: made(PLATE, {"left": "clamped"}, model="solid", magnetic=field([ASIDE, COIL]),
+                          loading=STEPS,
                           mesh={"size": 0.03}),
 }  # fmt: skip
 

@@ -76,7 +76,8 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
     )
     case = {
         "shell": {
-            "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0
+            "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1,
+            "poisson_ratio": 0
         },
         "boundary": {f"{name}_edge": {"held": ["x", "y"]} for name in ("lower", "upper")},
         "contact": [["upper", "lower"]],
@@ -84,7 +85,8 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
         "mesh": {"degree": 2},
         "loading": {
             "kind": "dead", "control": "load", "factor": 1, "points": 1,
-            "loads": [{"over": name, "per_area": [0, 0, sign * P * h]} for name, sign in (("upper", -1), ("lower", 1))],
+            "loads": [{"over": name, "per_area": [0, 0, sign * P * h]}
+                      for name, sign in (("upper", -1), ("lower", 1))],
         },
     }  # fmt: skip
     scene = Scene(Case.model_validate(case))

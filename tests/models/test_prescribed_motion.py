@@ -33,22 +33,30 @@ RIM = {"rim": "clamped"}
 PRESSURE = {"loading": {"kind": "pressure"}}
 KINDS = {
     "shell": lambda: moving_scene((PUSH, TURN, TWIST), SHORT, **SMALL, **FIELD),
-    "half": lambda: moving_scene((PUSH, TURN), {"geometry": "strip", "radius_to_thickness": 100, "width": 0.4},
+    "half": lambda: moving_scene((PUSH, TURN),
+                                 {"geometry": "strip", "radius_to_thickness": 100, "width": 0.4},
                                  {"root": "clamped", "tip": "clamped"}, symmetry="half", **SMALL),
-    "varying thickness": lambda: moving_scene((PUSH, TURN), {**SHORT, "thickness_factor": "1 + x/2"}, **SMALL),
-    "one component": lambda: moving_scene((move("lift", "right", shift=[0, 0, 0.4]),), SHORT, TIP, **SMALL),
-    "solid": lambda: moving_scene((PUSH, TURN), {**SHORT, "thickness": 0.1}, CLAMPED, **SOLID, **FIELD),
-    "meridian": lambda: moving_scene((UP,), RING, {"inner": "clamped", "outer": "clamped"}, symmetry="axisymmetric"),
+    "varying thickness": lambda: moving_scene((PUSH, TURN),
+                                              {**SHORT, "thickness_factor": "1 + x/2"}, **SMALL),
+    "one component": lambda: moving_scene((move("lift", "right", shift=[0, 0, 0.4]),), SHORT, TIP,
+                                          **SMALL),
+    "solid": lambda: moving_scene((PUSH, TURN), {**SHORT, "thickness": 0.1}, CLAMPED, **SOLID,
+                                  **FIELD),
+    "meridian": lambda: moving_scene((UP,), RING, {"inner": "clamped", "outer": "clamped"},
+                                     symmetry="axisymmetric"),
     "ring that rolls": lambda: moving_scene(
-        (move("up", "inner", shift=[0.1, 0, 0.3]), move("roll", "inner", turn=[0, 0.8, 0], centre=[0.4, 0, 0])),
+        (move("up", "inner", shift=[0.1, 0, 0.3]),
+         move("roll", "inner", turn=[0, 0.8, 0], centre=[0.4, 0, 0])),
         RING, {"inner": "clamped", "outer": "clamped"}, symmetry="axisymmetric",
     ),
-    "under pressure": lambda: moving_scene((ROLL, FALL), CAP, RIM, mesh={"degree": 3, "size": 1}, **PRESSURE),
+    "under pressure": lambda: moving_scene((ROLL, FALL), CAP, RIM, mesh={"degree": 3, "size": 1},
+                                           **PRESSURE),
     "meridian under pressure": lambda: moving_scene(
         (move("up", "top", shift=[0, 0, 0.3]),), TUBE, {"bottom": "clamped", "top": "clamped"},
         symmetry="axisymmetric", **PRESSURE,
     ),
-    "solid under pressure": lambda: moving_scene((ROLL,), CAP, RIM, model="solid", mesh={"size": 1}, **PRESSURE),
+    "solid under pressure": lambda: moving_scene((ROLL,), CAP, RIM, model="solid", mesh={"size": 1},
+                                                 **PRESSURE),
 }  # fmt: skip
 
 

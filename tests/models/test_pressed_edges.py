@@ -36,8 +36,8 @@ def standing(folder: Path, angle: float, floor_at: float = -0.3) -> dict[str, An
     strip = Sheet("strip", (0, 0, (1 + GAP) * h), tuple(up), (0, WIDTH, 0), (8, 1))
     return {
         "shell": {
-            "geometry": "mesh", "file": str(write(folder / "two.msh", [floor, strip])), "radius": 1, "thickness": h,
-            "youngs_modulus": 1, "poisson_ratio": 0,
+            "geometry": "mesh", "file": str(write(folder / "two.msh", [floor, strip])), "radius": 1,
+            "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0,
         },
         "boundary": {"floor": "clamped", "strip_2": "clamped"},
         "points": {"tip": [0, 0, (1 + GAP) * h], "end": [0, WIDTH, (1 + GAP) * h]},

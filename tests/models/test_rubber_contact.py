@@ -208,7 +208,7 @@ def test_derivatives_by_the_natural_stretch() -> None:
 
 
 def test_thin_walls_that_pass_through() -> None:
-    """Stretched walls may come nearer than half the undeformed thickness, and are then still apart."""
+    """Stretched walls may come nearer than half the undeformed thickness, and still be apart."""
     scene = sheets()
     (term,), r0 = scene.model.shell_contacts, scene.model.r0.x.array.reshape(-1, 3)
     upper = r0[:, 2] > h / 2

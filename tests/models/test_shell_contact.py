@@ -18,7 +18,8 @@ from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages
 Array = NDArray[np.float64]
 RING: dict[str, Any] = {
     "shell": {
-        "geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0
+        "geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": 0.02, "youngs_modulus": 1,
+        "poisson_ratio": 0
     },
     "boundary": {
         "bottom": "symmetry", "top": "symmetry",

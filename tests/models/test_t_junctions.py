@@ -40,13 +40,14 @@ def stiffened(length: float, height: float, modulus: float = 1.0) -> dict[str, A
         "shells": {"base": base, "web": web},
         "joints": [{"edges": ["web.bottom", "base"]}],
         "mesh": {"degree": 3, "size": 0.15},
-        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "base.right", "force": [0, 0, 1e-9]}],
+        "loading": {"kind": "dead", "control": "load",
+                    "loads": [{"edge": "base.right", "force": [0, 0, 1e-9]}],
                     "factor": 1, "points": 1},
     }  # fmt: skip
 
 
 def pushed(joint: dict[str, Any], off: float = 0.0) -> dict[str, Any]:
-    """A plate between clamped ends with a web across its middle, whose top a force pushes sideways."""
+    """A plate between clamped ends. A force pushes the top of a web across its middle sideways."""
     base = plate(1, WIDTH, boundary={"left": "clamped", "right": "clamped"})
     place = {"position": [0.5, 0, 0.3 + off], "axis": {"polar": 90}}
     web = plate(0.3, WIDTH, place=place, points={"top": [0, WIDTH / 2, 0]})
@@ -54,7 +55,8 @@ def pushed(joint: dict[str, Any], off: float = 0.0) -> dict[str, Any]:
         "shells": {"base": base, "web": web},
         "joints": [{"edges": ["web.right", "base"], **joint}],
         "mesh": {"degree": 3, "size": 0.1},
-        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "web.left", "force": [1e-9, 0, 0]}],
+        "loading": {"kind": "dead", "control": "load",
+                    "loads": [{"edge": "web.left", "force": [1e-9, 0, 0]}],
                     "factor": 1, "points": 1},
     }  # fmt: skip
 
@@ -103,13 +105,15 @@ def test_a_mesh_file_in_which_edges_have_three_triangles(tmp_path: Path, height:
         EI += h * (2 * abs(height)) ** 3 / 12
     file = write(tmp_path / "beam.msh", sheets, joined=True)
     data = {
-        "shell": {"geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1,
+        "shell": {"geometry": "mesh", "file": str(file), "radius": 1, "thickness": h,
+                  "youngs_modulus": 1,
                   "poisson_ratio": 0},
         "boundary": {f"{sheet.name}_4": "clamped" for sheet in sheets},
         "points": {"tip": [length, WIDTH / 2, 0]},
         "mesh": {"degree": 3},
         "symmetry": "none",
-        "loading": {"kind": "dead", "control": "load", "loads": [{"edge": "base_2", "force": [0, 0, 1e-9]}],
+        "loading": {"kind": "dead", "control": "load",
+                    "loads": [{"edge": "base_2", "force": [0, 0, 1e-9]}],
                     "factor": 1, "points": 1},
     }  # fmt: skip
     _, _, seen = end(data)
@@ -203,7 +207,10 @@ ASLANT = {
         ),
         (
             placed(LYING),
-            "the shell of the edge web.right lies in the mid-surface of base, where both take the same place",
+            (
+                "the shell of the edge web.right lies in the mid-surface of base, "
+                "where both take the same place"
+            ),
         ),
     ],
 )

@@ -36,7 +36,8 @@ def pair(
     }
     return {
         "shell": {
-            "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0
+            "geometry": "mesh", "file": str(file), "radius": 1, "thickness": h, "youngs_modulus": 1,
+            "poisson_ratio": 0
         },
         "boundary": edges,
         "contact": [["upper", "lower"]],

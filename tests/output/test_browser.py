@@ -165,7 +165,8 @@ def proportions_are_true(page: Page) -> None:
     )  # a sphere is a sphere
     traces = f"{DRAWN}.slice(0, -1).flatMap(t => [...t[c]].filter(v => v !== null))"
     places = page.value(
-        f"['x', 'y', 'z'].map(c => {{const v = {traces}; return [Math.min(...v), Math.max(...v)];}})"
+        f"['x', 'y', 'z'].map(c => {{const v = {traces}; "
+        "return [Math.min(...v), Math.max(...v)];})"
     )
     drawn = np.array(places)
     assert (drawn[:, 0] >= ranges[:, 0]).all()
@@ -222,7 +223,7 @@ def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
 def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
     page: Page, report: Any, tmp_path: Path
 ) -> None:
-    """Two folds 1 % of the curve apart: an inset around them as in curve.png, and none far apart."""
+    """Folds 1 % of the curve apart have an inset, as in curve.png. Folds far apart have none."""
     for gap, drawn in ((0.01, True), (0.5, False)):
         folder = tmp_path / f"{gap}"
         shutil.copytree(report("time").parent, folder)
@@ -251,7 +252,8 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
         page.open(folder / "report.html", 1200)
         page.wait("document.body.dataset.ready === 'yes'")
         ranges = page.value(
-            "['x', 'y'].map(c => document.getElementById('curve2d')._fullLayout[`${c}axis2`]?.range)"
+            "['x', 'y'].map(c => "
+            "document.getElementById('curve2d')._fullLayout[`${c}axis2`]?.range)"
         )
         if drawn:
             low, high = np.array([[w, load(w)] for w in ((1 - gap) * (middle - 1), middle - 1)])
@@ -259,7 +261,10 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
                 [low - INSET_MARGIN * (high - low), high + INSET_MARGIN * (high - low)]
             )
             assert np.array(ranges) == pytest.approx(around.T)
-            boxes = "['shell3d', 'curve2d'].map(n => document.getElementById(n).getBoundingClientRect().right)"
+            boxes = (
+                "['shell3d', 'curve2d'].map(n => "
+                "document.getElementById(n).getBoundingClientRect().right)"
+            )
             assert max(page.value(boxes)) <= 1200
         else:
             assert ranges == [None, None]

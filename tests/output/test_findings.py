@@ -52,7 +52,7 @@ def test_a_finding_is_read_back(tmp_path: Path, renumbered: bool) -> None:
 
 
 def test_a_finding_is_no_result(tmp_path: Path) -> None:
-    """Nor is a result a finding: a history that goes another way than that of its file is refused."""
+    """Nor is a result a finding. A history that goes another way than its file's is refused."""
     V = fem.functionspace(mesh.create_unit_square(MPI.COMM_SELF, 2, 2), ("Lagrange", 1, (3,)))
     file = tmp_path / "checkpoint"
     file.write_bytes(framed(b"{}") + framed(V.tabulate_dof_coordinates().tobytes()))

@@ -84,7 +84,7 @@ def test_bodies_are_where_their_approach_has_brought_them() -> None:
 
 
 def test_a_sphere_has_no_creases() -> None:
-    """Its poles once had: the cosine of 90 degrees is 6e-17, and lines around it made a black spot."""
+    """Its poles once had: the cosine of 90 degrees is 6e-17. Lines around it made a black spot."""
     ball = globe(2.0)
     assert ball.creases == []
     corners = ball.points[ball.triangles]

@@ -488,7 +488,8 @@ def test_unstable_from_the_first_bifurcation_on() -> None:
     }
     places = [("", 0, 0.0), ("", 0, 0.1), ("m = 3", 0, 0.15), ("m = 4", 1, 0.16), ("", 2, 0.2)]
     path = [
-        row | {"point": i, "mode": mode, "excluded_pivots": count, "p_over_pc": x, "volume_change": -x}
+        row | {"point": i, "mode": mode, "excluded_pivots": count, "p_over_pc": x,
+               "volume_change": -x}
         | ({"label": "bifurcation"} if mode else {})
         for i, (mode, count, x) in enumerate(places)
     ]  # fmt: skip

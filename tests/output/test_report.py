@@ -107,7 +107,7 @@ def page(
 
 
 def test_one_file_with_every_picture_and_no_reference(tmp_path: Path) -> None:
-    """Pictures are in it byte by byte, in the order of the report; nothing is looked for elsewhere."""
+    """Pictures are in it byte by byte, in the report's order. Nothing is looked for elsewhere."""
     names = [
         "curve.png",
         "shell.png",
@@ -148,9 +148,9 @@ def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:
     """p_c = 1.8e6 * 4/3/90^2 = 296.296 Pa, k_d p_c = 96.6617 Pa."""
     text = page(tmp_path, [FOLD | {"pressure_Pa": 0.326233305 * 1.8e6 * 4 / 3 / 90**2}]).text
     assert (
-        "The shell buckles at the knockdown factor kd = p/pc = 0.326233 (96.6617 Pa): a fold, w/h = 3.4 at the"
-        in text
-    )
+        "The shell buckles at the knockdown factor kd = p/pc = 0.326233 (96.6617 Pa): a fold, "
+        "w/h = 3.4 at the"
+    ) in text
     assert "296.296Pa" in text.replace("\n", "")
     assert "326233305" not in text
 
@@ -246,7 +246,7 @@ def test_interrupted_at_once_without_pictures(tmp_path: Path) -> None:
 
 
 def test_path_has_the_columns_that_vary(tmp_path: Path) -> None:
-    """Many points are folded away; a displacement that is another one but for rounding stands once."""
+    """Many points are folded away. A displacement that differs only by rounding stands once."""
     rows = [
         {
             "label": "step",

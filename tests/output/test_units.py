@@ -21,7 +21,10 @@ from magshell_fenicsx.quantities.registry import axes_of
 
 R, H, E, NU = 25.2e-3, 0.32e-3, 1.8e6, 0.5
 P_C = 2 * E / sqrt(3 * (1 - NU**2)) * (H / R) ** 2
-SHELL = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.32 mm, youngs_modulus: 1.8 MPa, poisson_ratio: 0.5, %s}"
+SHELL = (
+    "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.32 mm, youngs_modulus: 1.8 MPa, "
+    "poisson_ratio: 0.5, %s}"
+)
 DIMPLE = "defect: {kind: dimple, amplitude: 1.64, width: 3.2}"
 FIELD = "{remanent: {flux_density: %s}, applied: {flux_density: %s}}"
 NUMBER = r"[−-]?\d+(?:\.\d+)?(?:e[−-]?\d+)?"
@@ -109,7 +112,10 @@ def test_every_number_of_the_report_stands_in_a_file(buckled: tuple[Path, str]) 
     assert whole_report(buckled[0]) > 30
 
 
-SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modulus: 1.8 MPa, poisson_ratio: 0.3, %s}"
+SPHERE = (
+    "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modulus: 1.8 MPa, "
+    "poisson_ratio: 0.3, %s}"
+)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +142,10 @@ SPHERE = "{geometry: hemisphere, radius: 25.2 mm, thickness: 0.8 mm, youngs_modu
             [
                 f"shell={SPHERE % DIMPLE}",
                 *("mesh={degree: 3, refinement: 0.5}", "loading.sensitivities=true"),
-                "gradients={of: [buckling_pressure_Pa, knockdown], by: [shell.poisson_ratio, thickness]}",
+                (
+                    "gradients={of: [buckling_pressure_Pa, knockdown], "
+                    "by: [shell.poisson_ratio, thickness]}"
+                ),
             ],
             marks=pytest.mark.slow,
         ),

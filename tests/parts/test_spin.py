@@ -31,8 +31,8 @@ def disc(model: str = "shell", symmetry: str = "auto", **further: Any) -> Case:
     }
     mesh = {"size": 0.25} if symmetry != "auto" else {}
     return made(
-        model=model, shell=shell, boundary={"rim": "hinged"}, points={"here": [0.5, 0, 0]}, symmetry=symmetry,
-        **({"mesh": mesh} if mesh else {}), **further,
+        model=model, shell=shell, boundary={"rim": "hinged"}, points={"here": [0.5, 0, 0]},
+        symmetry=symmetry, **({"mesh": mesh} if mesh else {}), **further,
     )  # fmt: skip
 
 

@@ -248,7 +248,10 @@ def test_compilers_that_are_refused(
     given: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A quotation without its end, and a compiler that lacks an option of the kernels."""
-    text = '#!/bin/sh\ncase "$*" in *-std=*) echo "error: unknown option" >&2; exit 1 ;; esac\nexec cc "$@"\n'
+    text = (
+        '#!/bin/sh\ncase "$*" in *-std=*) echo "error: unknown option" >&2; exit 1 ;; esac\n'
+        'exec cc "$@"\n'
+    )
     monkeypatch.setenv(
         "CC", given.format(refusing=shlex.quote(str(program(tmp_path, "refusing", text))))
     )

@@ -105,9 +105,11 @@ def test_a_model_that_is_too_large(
     done = magshell(command, *words)
     assert done.returncode == 2
     said = re.fullmatch(
-        r".*dimple_buckling\.yaml(?::\d+)?: mesh: about ([\d.e+]+) unknowns at radius/thickness 90 take ([\d.]+) to "
-        r"([\d.]+) GB of memory, and 0\.3 GB are free: lower mesh\.refinement \(1\) or mesh\.degree \(4\); where "
-        r".* symmetry: half halves it; ranks on several machines share it; MAGSHELL_MEMORY=GB in the environment .*\n",
+        r".*dimple_buckling\.yaml(?::\d+)?: mesh: about ([\d.e+]+) unknowns at radius/thickness "
+        r"90 take ([\d.]+) to ([\d.]+) GB of memory, and 0\.3 GB are free: "
+        r"lower mesh\.refinement \(1\) or mesh\.degree \(4\); where "
+        r".* symmetry: half halves it; ranks on several machines share it; "
+        r"MAGSHELL_MEMORY=GB in the environment .*\n",
         done.stderr,
     )
     assert said

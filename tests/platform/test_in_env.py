@@ -12,7 +12,8 @@ from conftest import CASES
 
 TOP = CASES.parent
 TOOLS = (  # all that a machine without anything has
-    "bash cat cksum echo cp cut dirname env find flock getconf grep head id mkdir mktemp mv readlink rm sed tail touch"
+    "bash cat cksum echo cp cut dirname env find flock getconf grep head id mkdir mktemp mv "
+    "readlink rm sed tail touch"
     " tr uname xargs"
 )
 ARGUMENTS = "#!/bin/sh\nprintf '%s\\n' \"$@\"\n"

@@ -26,9 +26,11 @@ boundary: {{equator: clamped}}
 loading: {{kind: pressure, until: limit}}
 """
 GRID = """
-shell: {{geometry: plate, length: 20 mm, width: 5 mm, thickness: 0.2 mm, youngs_modulus: 1 MPa, poisson_ratio: 0.5}}
+shell: {{geometry: plate, length: 20 mm, width: 5 mm, thickness: 0.2 mm, youngs_modulus: 1 MPa, \
+poisson_ratio: 0.5}}
 boundary: {{left: clamped}}
-magnetic: {{remanent: {{flux_density: 100 mT}}, applied: {{sources: [{{kind: grid, file: "{file}"}}]}}}}
+magnetic: {{remanent: {{flux_density: 100 mT}}, \
+applied: {{sources: [{{kind: grid, file: "{file}"}}]}}}}
 """
 MESH = """
 shell: {{geometry: mesh, file: "{file}", radius: 1, thickness: 0.1, poisson_ratio: 0.3}}
@@ -41,11 +43,15 @@ KINDS = {
     "mesh": MESH,
 }
 VTI = (
-    '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian"><ImageData WholeExtent="{0}" Origin="0 0 0" '
-    'Spacing="1 1 1"><Piece Extent="{0}"><PointData><DataArray type="Float64" Name="B" NumberOfComponents="3" '
+    '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian">'
+    '<ImageData WholeExtent="{0}" Origin="0 0 0" Spacing="1 1 1"><Piece Extent="{0}">'
+    '<PointData><DataArray type="Float64" Name="B" NumberOfComponents="3" '
     'format="ascii">0 0 0</DataArray></PointData></Piece></ImageData></VTKFile>'
 )
-LEGACY = "# vtk DataFile Version 3.0\nB\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS {0} {0} {0}\nORIGIN 0 0 0\n"
+LEGACY = (
+    "# vtk DataFile Version 3.0\nB\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS {0} {0} {0}\n"
+    "ORIGIN 0 0 0\n"
+)
 LIMIT = 6 * 2**30  # bytes of addresses: far more than any message needs
 
 
@@ -93,8 +99,10 @@ MADE = {
     ),
     "huge.vtk": lambda file: file.write_text(LEGACY.format(99999), encoding="utf-8"),
     "huge.vtu": lambda file: file.write_text(
-        '<VTKFile type="UnstructuredGrid"><UnstructuredGrid><Piece NumberOfPoints="9999999999" NumberOfCells="1">'
-        '<Points><DataArray type="Float64" NumberOfComponents="3"/></Points></Piece></UnstructuredGrid></VTKFile>',
+        '<VTKFile type="UnstructuredGrid"><UnstructuredGrid>'
+        '<Piece NumberOfPoints="9999999999" NumberOfCells="1">'
+        '<Points><DataArray type="Float64" NumberOfComponents="3"/></Points>'
+        "</Piece></UnstructuredGrid></VTKFile>",
         encoding="utf-8",
     ),
     "damaged.vti": lambda file: file.write_text(VTI.format("0 5 0 5 0 5")[:150], encoding="utf-8"),

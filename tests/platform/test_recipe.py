@@ -1,4 +1,4 @@
-"""The recipe for Apptainer has what the Dockerfile has; conda's list has what pyproject.toml needs."""
+"""Apptainer's recipe has what the Dockerfile has. Conda's list has what pyproject.toml needs."""
 
 import re
 import shlex

@@ -135,7 +135,7 @@ def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
     [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, -signal.SIGTERM, marks=pytest.mark.slow)],
 )
 def test_stopped_while_a_mesh_is_found(tmp_path: Path, number: signal.Signals, code: int) -> None:
-    """Nothing can be resumed, so the process ends at once; the line that told of the mesh is gone."""
+    """Nothing can be resumed, so the process ends at once. The line about the mesh is gone."""
     case = CASES / "dimple_buckling.yaml"
     terminal = Terminal(
         "run", case, "--set=mesh.tolerance=1e-5", "--set=symmetry=half", "--out", tmp_path

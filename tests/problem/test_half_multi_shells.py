@@ -222,7 +222,8 @@ PLIES = {
     "plies": [{"angle": 30, "E1": 2, "E2": 1, "nu12": 0.3, "G12": 0.4, "fraction": 1}],
 }
 NOT_HALVED: dict[str, dict[str, Any]] = {
-    "planes of their own": {"shells": {"low": tube(0), "high": plate([3, 1, 0], boundary={"left": "clamped"})}},
+    "planes of their own": {"shells": {"low": tube(0),
+                                       "high": plate([3, 1, 0], boundary={"left": "clamped"})}},
     "one that is held by nothing": {"shells": {"low": tube(0), "high": plate([3, -0.25, 0])}},
     "plies across the plane": {"shells": {"low": tube(0), "high": tube(1, laminate=PLIES)}},
     "a joint in the plane": {

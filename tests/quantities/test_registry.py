@@ -16,8 +16,9 @@ from magshell_fenicsx.quantities.registry import (
 )
 
 FIRST_RELEASE = """
-point label amplitude p_over_pc lambda_m force w_over_h w_from_field_over_h w_pole_over_h volume_change energy
-negative_pivots negative_pivots_held iterations factorisations wall_s stretching bending magnetic U1 Uq Utau mode
+point label amplitude p_over_pc lambda_m force w_over_h w_from_field_over_h w_pole_over_h
+volume_change energy negative_pivots negative_pivots_held iterations factorisations wall_s
+stretching bending magnetic U1 Uq Utau mode
 field_angle branch w_point_over_h error_over_h load_error excluded_pivots
 """
 

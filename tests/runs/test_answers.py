@@ -194,7 +194,7 @@ def test_best_estimate_of_a_meridian_is_kept(tmp_path: Path) -> None:
 
 
 def test_better_round_than_that_of_the_mesh_that_is_taken() -> None:
-    """Of a surface, where a coarser mesh within the tolerance is cheaper: both numbers are there."""
+    """Of a surface. A coarser mesh within the tolerance is cheaper: both numbers are there."""
     rounds = [
         AdaptiveRound(3, 0.5, 300, 5000, 0.330001, 2e-6),
         AdaptiveRound(3, 0.4, 200, 3000, 0.3301, 5e-4),

@@ -324,9 +324,12 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def test_files(tmp_path: Path) -> None:
-    """A steel plate in hertz: 10.2158/(2 pi R^2) sqrt(D/(rho h)); pictures, modes and the report."""
+    """A steel plate in hertz: 10.2158/(2 pi R^2) sqrt(D/(rho h)). Pictures, modes, the report."""
     R, h, E, rho = 0.1, 0.001, 2e11, 7800.0
-    steel = "{geometry: disc, radius: 100 mm, thickness: 1 mm, youngs_modulus: 200 GPa, poisson_ratio: 0.3,"
+    steel = (
+        "{geometry: disc, radius: 100 mm, thickness: 1 mm, youngs_modulus: 200 GPa, "
+        "poisson_ratio: 0.3,"
+    )
     settings = [
         f"--set=shell={steel} density: 7800 kg/m^3}}",
         "--set=frequencies={count: 3, at: all}",
@@ -419,9 +422,12 @@ def test_a_sector_has_the_frequencies_of_the_whole_shell(tmp_path: Path) -> None
     first (meridian).
     """
     text = (
-        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
-        "mesh: {degree: 3, refinement: 0.7}\nfrequencies: {count: 8, at: end}\nstability: {at: end}\n"
-        "loading: {kind: pressure, control: load, until: target, pressure: 0.46, points: 1}\nsymmetry: %s\n"
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 30, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\n"
+        "mesh: {degree: 3, refinement: 0.7}\n"
+        "frequencies: {count: 8, at: end}\nstability: {at: end}\n"
+        "loading: {kind: pressure, control: load, until: target, pressure: 0.46, points: 1}\n"
+        "symmetry: %s\n"
     )
     found = {}
     for symmetry in ("5", "axisymmetric"):

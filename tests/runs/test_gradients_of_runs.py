@@ -90,7 +90,10 @@ def test_same_on_ranks(tmp_path: Path) -> None:
     [
         (
             "{of: [sideways]}",
-            "gradients.of: sideways: has no gradient here; allowed are knockdown, buckling_pressure_Pa",
+            (
+                "gradients.of: sideways: has no gradient here; allowed are knockdown, "
+                "buckling_pressure_Pa"
+            ),
         ),
         ("{of: [force_N]}", "gradients.of: force_N: has no gradient here; allowed are"),
         (

@@ -31,7 +31,10 @@ def test_another_case_is_refused(out: Path, tmp_path: Path) -> None:
     case = other(tmp_path, "symmetry: half\n")
     refused = magshell("run", case, *SMALL, "--out", out)
     assert refused.returncode == 2
-    said = f"--out {out}: has a run of dimple_buckling.yaml, which is kept; give another folder, or --overwrite"
+    said = (
+        f"--out {out}: has a run of dimple_buckling.yaml, which is kept; give another folder, "
+        "or --overwrite"
+    )
     assert said in " ".join(refused.stderr.split())
     assert (out / "summary.json").read_bytes() == before
     with pytest.raises(ms.CaseError, match="which is kept; give another folder"):
@@ -125,7 +128,8 @@ def test_files_of_others_are_refused(tmp_path: Path, text: str) -> None:
         refused = magshell("run", FILE, *SMALL, "--out", tmp_path, *how)
         assert refused.returncode == 2
         assert refused.stderr == (
-            f"{tmp_path}: has files that a run would replace and that none is known to have written: "
+            f"{tmp_path}: has files that a run would replace and that none is known to "
+            "have written: "
             f"{', '.join(sorted(MINE))}; move them away, or give another folder\n"
         )
         assert content(tmp_path) == before

@@ -1,4 +1,4 @@
-"""A run that is killed goes on from there, on another number of ranks, as if nothing had happened."""
+"""A killed run goes on from there, on another number of ranks, as if nothing had happened."""
 
 import json
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ def test_killed_and_resumed(whole: Whole, tmp_path: Path) -> None:
 
 
 def check_goes_on_as(whole: Whole, out: Path, seen: bytes, ranks: int = 1) -> None:
-    """Resumed, a run has the rows and files of a whole one; what was known is not computed again."""
+    """Resumed, a run has a whole one's rows and files. What was known is not computed again."""
     done = magshell("run", *whole.case, "--out", out, "--resume", ranks=ranks)
     assert done.returncode == 0, done.stderr
     assert (out / "path.csv").read_bytes().startswith(seen)
@@ -121,7 +121,10 @@ def test_complete_already(whole: Whole) -> None:
 def test_another_case(tmp_path: Path, no_pictures: None) -> None:
     """And a run that was stopped keeps its checkpoint."""
     assert magshell("run", *MERIDIAN, "--out", tmp_path, "--time-limit", 0).returncode == 3
-    said = f"--resume: {tmp_path} belongs to another run: shell.radius_to_thickness is 90.0 there and 100.0 here"
+    said = (
+        f"--resume: {tmp_path} belongs to another run: shell.radius_to_thickness is 90.0 there "
+        "and 100.0 here"
+    )
     other = (*MERIDIAN, "--set=shell.radius_to_thickness=100")
     for ranks in (0, 2):
         done = magshell("run", *other, "--out", tmp_path, "--resume", ranks=ranks)

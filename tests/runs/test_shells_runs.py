@@ -62,7 +62,7 @@ def test_resume(tmp_path: Path) -> None:
 
 
 def test_two_shells_from_python() -> None:
-    """Caps apart, one upside down and thicker, under one pressure: each moves as a cap alone does."""
+    """Caps apart, one upside down and thicker, under one pressure: each moves as if alone."""
     keys = {"radius": "25 mm", "polar": 25, "youngs_modulus": "1.8 MPa", "poisson_ratio": 0.3}
     mesh = ms.Section("mesh", degree=2, size="8 mm")
     load = {"control": "load", "until": "target", "pressure": "20 Pa", "points": 1}

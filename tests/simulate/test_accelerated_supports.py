@@ -30,7 +30,7 @@ def moved(history: Any, **keys: Any) -> dict[str, Any]:
 
 
 def test_accelerated_support() -> None:
-    """A root that is accelerated evenly bends a strip as a sudden load of its mass times that does."""
+    """An evenly accelerated root bends a strip as a sudden load does: its mass times that."""
     found = moved(f"{SMALL} + {ACCELERATION / 2}*t**2")
     area = {"kind": "dead", "loads": [{"over": "all", "per_area": [0, 0, -ACCELERATION / 50]}]}
     sudden = {

@@ -191,7 +191,8 @@ def test_what_a_larger_model_is_given() -> None:
         "moves": [{"supports": ["upper.left", "upper.right"], "translation": [0, -1, 0]}],
     }
     data = {
-        "shells": {"lower": one, "upper": one | {"place": {"position": [0, 2.021, 0], "turn": 180}}},
+        "shells": {"lower": one,
+                   "upper": one | {"place": {"position": [0, 2.021, 0], "turn": 180}}},
         "contact": [["upper", "lower"]], "mesh": {"size": 0.12, "degree": 2}, "loading": load,
     }  # fmt: skip
     half, whole = (Scene(Case.from_source(data | {"symmetry": how})) for how in ("auto", "none"))

@@ -1,4 +1,4 @@
-"""Contacts in time: the balance of energy through impact and release, and runs that stay together."""
+"""Contacts in time: the balance of energy through impact and release. Runs that stay together."""
 
 from typing import Any
 

@@ -24,11 +24,13 @@ Array = NDArray[np.float64]
 STEP = 1e-2  # of h
 STRIP: dict[str, Any] = {
     "shell": {
-        "geometry": "strip", "radius": "1 m", "thickness": "10 mm", "width": 0.1, "poisson_ratio": 0.2,
+        "geometry": "strip", "radius": "1 m", "thickness": "10 mm", "width": 0.1,
+        "poisson_ratio": 0.2,
         "youngs_modulus": "1 Pa", "imperfections": [{"kind": "formula", "w0": "3*x**2*(1 - x)"}],
         "thickness_factor": "1 + 0.3*x + 5*z",
     },
-    "boundary": {"root": "clamped"}, "points": {"tip": ["1 m", 0, 0]}, "mesh": {"degree": 2, "refinement": 0.4},
+    "boundary": {"root": "clamped"}, "points": {"tip": ["1 m", 0, 0]},
+    "mesh": {"degree": 2, "refinement": 0.4},
     "magnetic": {
         "lambda_m": 3.3e-5, "applied": {"polar": 0},
         "remanent": {"kind": "expression", "components": ["cos(3*x) + 10*z", "0", "1 + x*z"]},
@@ -38,14 +40,16 @@ STRIP: dict[str, Any] = {
         "kind": "dead", "control": "load", "factor": 0.5, "points": 1,
         "loads": [
             {"over": "all", "per_area": [0, 0, "1e-8*(1 + 30*z)"]},
-            {"edge": "tip", "force": ["1e-10 N", 0, "2e-10 N"]}, {"over": "all", "pressure": "1e-9 Pa"},
+            {"edge": "tip", "force": ["1e-10 N", 0, "2e-10 N"]},
+            {"over": "all", "pressure": "1e-9 Pa"},
         ],
     },
 }  # fmt: skip
 CAP: dict[str, Any] = {
     "shell": {
-        "geometry": "cap", "radius": "1 m", "polar": 30, "thickness": "20 mm", "youngs_modulus": "1 Pa",
-        "poisson_ratio": 0.3, "imperfections": [{"kind": "formula", "w0": "-2*exp(-(x**2 + y**2)/0.05)"}],
+        "geometry": "cap", "radius": "1 m", "polar": 30, "thickness": "20 mm",
+        "youngs_modulus": "1 Pa", "poisson_ratio": 0.3,
+        "imperfections": [{"kind": "formula", "w0": "-2*exp(-(x**2 + y**2)/0.05)"}],
         "thickness_factor": "0.8 + z",
     },
     "boundary": {"rim": "clamped"}, "points": {"top": [0, 0, "1 m"]},
@@ -73,11 +77,13 @@ def further(data: dict[str, Any], w0: str, c: float) -> Case:
 @pytest.mark.parametrize(
     ("data", "way", "load", "results"),
     [
-        pytest.param(STRIP, ALONG, "load", ["tip_uz", "w_over_h"], id="strip", marks=pytest.mark.slow),
-        pytest.param(CAP | {"loading": DEAD}, AROUND, "load", ["top_uz", "w_over_h"], id="meridian"),
+        pytest.param(STRIP, ALONG, "load", ["tip_uz", "w_over_h"], id="strip",
+                     marks=pytest.mark.slow),
+        pytest.param(CAP | {"loading": DEAD}, AROUND, "load", ["top_uz", "w_over_h"],
+                     id="meridian"),
         pytest.param(
-            CAP | {"loading": PUSHED, "symmetry": "half", "mesh": {"degree": 3, "size": "0.2 m"}}, AROUND,
-            "force", ["w_over_h"], id="half", marks=pytest.mark.slow,
+            CAP | {"loading": PUSHED, "symmetry": "half", "mesh": {"degree": 3, "size": "0.2 m"}},
+            AROUND, "force", ["w_over_h"], id="half", marks=pytest.mark.slow,
         ),
     ],
 )  # fmt: skip

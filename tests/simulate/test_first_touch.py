@@ -11,11 +11,13 @@ from magshell_fenicsx.simulate.follow import follow
 h, LOAD = 0.02, 4e-5
 CAP: dict[str, Any] = {
     "shell": {
-        "geometry": "cap", "radius": 1, "polar": 30, "thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3,
+        "geometry": "cap", "radius": 1, "polar": 30, "thickness": h, "youngs_modulus": 1,
+        "poisson_ratio": 0.3,
     },
     "boundary": {"rim": "clamped"},
     "bodies": {
-        "ball": {"kind": "sphere", "radius": 0.2, "position": [0, 0, 0.72], "direction": [0, 0, 1], "side": "inside"}
+        "ball": {"kind": "sphere", "radius": 0.2, "position": [0, 0, 0.72], "direction": [0, 0, 1],
+                 "side": "inside"}
     },
     "loading": {"kind": "dead", "loads": [{"force": [0, 0, -1]}], "factor": LOAD, "points": 1},
 }  # fmt: skip

@@ -209,8 +209,10 @@ result = run(Case.load(file, settings))
 fold = find_fold(result.scene.newton, FoldGuess(result.last), "pressure")
 other = Scene(Case.load(file, [*settings, "shell.radius_to_thickness=95"]))
 u, phi = (transfer(result.scene, other, v) for v in (fold.state.u, fold.phi))
-there = find_fold(other.newton, FoldGuess(other.unloaded().with_(u, "pressure", fold.value), phi), "pressure")
-found = {"there": there.value, "curvature": there.curvature, "k_d": fold.value, **sensitivities(result.scene, fold)}
+guess = FoldGuess(other.unloaded().with_(u, "pressure", fold.value), phi)
+there = find_fold(other.newton, guess, "pressure")
+found = {"there": there.value, "curvature": there.curvature, "k_d": fold.value}
+found |= sensitivities(result.scene, fold)
 if MPI.COMM_WORLD.rank == 0:
     print(json.dumps([found, fold.unstable, fold.factorisations, there.factorisations]))
 """

@@ -52,7 +52,7 @@ def case_of(**sections: Any) -> Case:
 
 
 def test_a_magnetised_plate_is_a_compass_needle() -> None:
-    """omega = sqrt(m B/I) of a thin rigid plate, with the pendulum's 1 + angle^2/16 in its period."""
+    """omega = sqrt(m B/I) of a thin rigid plate. The period has the pendulum's 1 + angle^2/16."""
     case = case_of(loading=SWING)
     assert "nothing is held" not in describe(case)
     scene = Scene(case)

@@ -272,7 +272,10 @@ def test_a_gas_has_numbers_of_its_own() -> None:
     """
     steps = [
         "{kind: pressure, control: load, until: target, pressure: 0.1, points: 1}",
-        "{kind: indentation, at: {polar: 0}, depth: 0.5, points: 1, hold: {pressure: {gas: {ambient_over_pc: 2}}}}",
+        (
+            "{kind: indentation, at: {polar: 0}, depth: 0.5, points: 1, "
+            "hold: {pressure: {gas: {ambient_over_pc: 2}}}}"
+        ),
     ]
     settings = [
         "shell.defect=null",

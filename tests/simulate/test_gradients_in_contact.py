@@ -1,4 +1,4 @@
-"""Gradients of shells that press on each other against differences of runs that are solved again."""
+"""Gradients of shells that press on each other, against differences of runs solved again."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -57,15 +57,17 @@ CAPS: dict[str, Any] = {
     },
 }  # fmt: skip
 ARCH = {
-    "geometry": "cylinder", "radius": 1, "length": 0.12, "azimuth": [60, 120], "thickness": h, "youngs_modulus": 1,
-    "poisson_ratio": 0.3,
+    "geometry": "cylinder", "radius": 1, "length": 0.12, "azimuth": [60, 120], "thickness": h,
+    "youngs_modulus": 1, "poisson_ratio": 0.3,
 }  # fmt: skip
 ARCHES: dict[str, Any] = {
     "shells": {
-        "lower": {"shell": ARCH, "boundary": {"left": "clamped", "right": "clamped"}, "points": {"top": [0, 1, 0.06]}},
+        "lower": {"shell": ARCH, "boundary": {"left": "clamped", "right": "clamped"},
+                  "points": {"top": [0, 1, 0.06]}},
         "upper": {
             "shell": ARCH | {"youngs_modulus": 2.0, "thickness": 0.025},
-            "boundary": {"left": "clamped", "right": "clamped"}, "remanent": {"polar": 90, "azimuth": 90},
+            "boundary": {"left": "clamped", "right": "clamped"},
+            "remanent": {"polar": 90, "azimuth": 90},
             "place": {"position": [0, 2 + GAP, 0], "turn": 180},
         },
     },

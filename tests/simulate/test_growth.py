@@ -36,7 +36,10 @@ def case(*loading: dict[str, Any], imperfections: Any = (DIMPLE,), **others: Any
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
 def test_derivatives_and_the_shell_that_has_it_from_the_start(symmetry: str) -> None:
-    """At any state in a field under pressure; a second imperfection, by formula, grows by itself."""
+    """At any state in a field under pressure.
+
+    A second imperfection, by formula, grows by itself.
+    """
     smooth = {"kind": "formula", "w0": "0.5*(x**2 + y**2)"}
     common: dict[str, Any] = {
         "symmetry": symmetry,

@@ -326,14 +326,17 @@ def test_resumed(tmp_path: Path, no_pictures: None) -> None:
 
 @pytest.mark.slow
 def test_ranks(tmp_path: Path) -> None:
-    """The same columns on one rank and on two, with a volume that is held and a support that moves."""
+    """The same columns on one rank and on two. A volume is held and a support moves."""
     file = tmp_path / "case.yaml"
     file.write_text(
-        "shell: {geometry: disc, radius_to_thickness: 50, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "shell: {geometry: disc, radius_to_thickness: 50, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\n"
         "symmetry: half\nmesh: {degree: 2, refinement: 0.5}\nloading:\n"
-        "- {kind: edge, name: lift, moves: [{supports: [rim], translation: [0, 0, 1]}], factor: 1e-9, control: load}\n"
+        "- {kind: edge, name: lift, moves: [{supports: [rim], translation: [0, 0, 1]}], "
+        "factor: 1e-9, control: load}\n"
         "- {kind: indentation, at: {polar: 0}, control: load, force: 0.01, points: 1}\n"
-        "- {kind: time, duration: 20, step: 4, points: 1, hold: {pressure: conjugate}, history: {force: '0.1'}}\n"
+        "- {kind: time, duration: 20, step: 4, points: 1, hold: {pressure: conjugate}, "
+        "history: {force: '0.1'}}\n"
         "- {kind: time, duration: 20, step: 4, points: 1, history: {lift: 1e-9 + t**2*1e-5}}\n"
     )
     columns = ("kinetic", "stored", "work", "w_over_h")

@@ -41,7 +41,7 @@ def steep(r0: Jet, u: Jet) -> Expr:
 
 
 def ended(r0: Jet, u: Jet) -> Expr:
-    """A number until the shell has moved down by 0.005 R, without a force there that would hold it."""
+    """A number until the shell has moved down by 0.005 R. No force there would hold it."""
     return 1e-4 * (0.005 + u.r[2]) ** 2.5
 
 

@@ -95,28 +95,29 @@ PLATE = {
     "poisson_ratio": 0,
 }
 MAGNET = {
-    "kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T", "axis": {"polar": -90},
-    "position": ["55 mm", 0, "-30 mm"],
+    "kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T",
+    "axis": {"polar": -90}, "position": ["55 mm", 0, "-30 mm"],
 }  # fmt: skip
 SOURCES = {
     "remanent": {"polar": 90, "azimuth": 0, "flux_density": "3 mT"},
     "applied": {"sources": [MAGNET]},
 }
 STRIP_OF_MM = {
-    "geometry": "strip", "radius": "30 mm", "width": 0.1666, "thickness": "0.5 mm", "youngs_modulus": "1 MPa",
-    "poisson_ratio": 0,
+    "geometry": "strip", "radius": "30 mm", "width": 0.1666, "thickness": "0.5 mm",
+    "youngs_modulus": "1 MPa", "poisson_ratio": 0,
 }  # fmt: skip
 OF_ALL_KINDS: dict[str, dict[str, Any]] = {
     "contact of a meridian under pressure": {
-        "shell": HEMISPHERE, "boundary": {"equator": "clamped"}, "bodies": {"ball": BALL}, "mesh": {"refinement": 0.3},
+        "shell": HEMISPHERE, "boundary": {"equator": "clamped"}, "bodies": {"ball": BALL},
+        "mesh": {"refinement": 0.3},
         "loading": [{"kind": "contact", "body": "ball", "approach": 1}, {"kind": "pressure"}],
     },
     "contact and growing dimple of half a shell": {
-        "shell": {**HEMISPHERE, "imperfections": [DIMPLE]}, "boundary": {"equator": "clamped"}, "symmetry": "half",
-        "bodies": {"ball": BALL}, "mesh": {"degree": 2, "refinement": 0.3},
+        "shell": {**HEMISPHERE, "imperfections": [DIMPLE]}, "boundary": {"equator": "clamped"},
+        "symmetry": "half", "bodies": {"ball": BALL}, "mesh": {"degree": 2, "refinement": 0.3},
         "loading": [
-            {"kind": "contact", "body": "ball", "approach": 1}, {"kind": "imperfection", "factor": 1},
-            {"kind": "pressure"},
+            {"kind": "contact", "body": "ball", "approach": 1},
+            {"kind": "imperfection", "factor": 1}, {"kind": "pressure"},
         ],
     },
     "growing dimple of a meridian in a field": {
@@ -125,17 +126,20 @@ OF_ALL_KINDS: dict[str, dict[str, Any]] = {
         "loading": [{"kind": "pressure"}, {"kind": "imperfection", "factor": 1}],
     },
     "magnet that moves past a strip": {
-        "shell": STRIP_OF_MM, "boundary": {"root": "clamped"}, "magnetic": SOURCES, "mesh": {"degree": 2},
-        "loading": [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}],
+        "shell": STRIP_OF_MM, "boundary": {"root": "clamped"}, "magnetic": SOURCES,
+        "mesh": {"degree": 2},
+        "loading": [{"kind": "field", "points": 1},
+                    {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}],
     },
     "magnet above a solid": {
-        "model": "solid", "shell": {**STRIP_OF_MM, "thickness": "3 mm"}, "boundary": {"root": "clamped"},
-        "magnetic": SOURCES, "mesh": {"refinement": 0.3},
-        "loading": [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}],
+        "model": "solid", "shell": {**STRIP_OF_MM, "thickness": "3 mm"},
+        "boundary": {"root": "clamped"}, "magnetic": SOURCES, "mesh": {"refinement": 0.3},
+        "loading": [{"kind": "field", "points": 1},
+                    {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}],
     },
     "moving edge under live pressure": {
-        "shell": PLATE, "boundary": {"left": "clamped", "right": "clamped"}, "mesh": {"degree": 2, "size": 0.2},
-        "symmetry": "none",
+        "shell": PLATE, "boundary": {"left": "clamped", "right": "clamped"},
+        "mesh": {"degree": 2, "size": 0.2}, "symmetry": "none",
         "loading": [
             {"kind": "pressure"},
             {"kind": "edge", "name": "lift", "factor": 1,
@@ -143,7 +147,8 @@ OF_ALL_KINDS: dict[str, dict[str, Any]] = {
                         "rotation": {"axis": [0, 1, 0], "angle": 20, "point": [1, 0, 0]}}]},
         ],
     },
-    "strip under a moment": {**ROLLED, "loading": [BY_LOAD], "mesh": {"degree": 2, "refinement": 0.3}},
+    "strip under a moment": {**ROLLED, "loading": [BY_LOAD],
+                             "mesh": {"degree": 2, "refinement": 0.3}},
 }  # fmt: skip
 
 

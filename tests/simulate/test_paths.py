@@ -89,7 +89,10 @@ def test_coarse_field_steps_do_not_jump_over_a_fold(points: int) -> None:
 
 def test_target_beyond_the_fold_in_units() -> None:
     """p_c of R/h = 40, in pascals; a target without a control is reached by load control."""
-    shell = "shell={geometry: hemisphere, radius: 40 mm, thickness: 1 mm, youngs_modulus: 1.3 MPa, poisson_ratio: 0.5, "
+    shell = (
+        "shell={geometry: hemisphere, radius: 40 mm, thickness: 1 mm, youngs_modulus: 1.3 MPa, "
+        "poisson_ratio: 0.5, "
+    )
     shell += "defect: {kind: dimple, amplitude: 1, width: 3}}"
     found = result(
         "dimple_buckling.yaml",

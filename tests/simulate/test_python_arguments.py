@@ -12,7 +12,8 @@ from magshell_fenicsx.problem.problem import Document
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
-    "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.28 mm, youngs_modulus: 1.8 MPa, poisson_ratio: 0.5, "
+    "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.28 mm, youngs_modulus: 1.8 MPa, "
+    "poisson_ratio: 0.5, "
     "defect: {kind: dimple, amplitude: 1.64, width: 3.2}}"
 ]
 

@@ -15,9 +15,11 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene_reuse import SceneReuse, update_fields
 
 STRIP = """
-shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2, thickness_factor: "1"}
+shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2, \
+thickness_factor: "1"}
 boundary: {root: clamped}
-magnetic: {lambda_m: 3.3e-5, remanent: {kind: points, file: one.csv, filter: 0.3}, applied: {polar: 0}}
+magnetic: {lambda_m: 3.3e-5, remanent: {kind: points, file: one.csv, filter: 0.3}, \
+applied: {polar: 0}}
 natural: {curvature: [0, 0, 0]}
 mesh: {degree: 2, refinement: 0.4}
 loading: {kind: field, points: 2}

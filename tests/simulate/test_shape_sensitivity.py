@@ -24,7 +24,10 @@ def test_of_the_meridian(kind: str) -> None:
     """On meshes that follow the rim; off the pole the derivative is zero by symmetry, and is not
     asked for there.
     """
-    one = f"[{{kind: {kind}, amplitude: 1.2, width: 2.5}}, {{kind: formula, w0: x**2 + y**2, amplitude: 0.1}}]"
+    one = (
+        f"[{{kind: {kind}, amplitude: 1.2, width: 2.5}}, "
+        "{kind: formula, w0: x**2 + y**2, amplitude: 0.1}]"
+    )
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", [f"shell.imperfections={one}"]))
     *_, last = follow(scene)
     found = sensitivities(scene, fold := fold_at(scene, last))

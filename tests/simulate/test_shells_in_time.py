@@ -193,7 +193,7 @@ def test_a_plane_with_a_position_beside_several_shells() -> None:
 def test_the_start_row_has_the_energy_of_the_initial_velocity(
     symmetry: str, mesh: dict[str, float]
 ) -> None:
-    """m v^2/2 of two discs that move as (1 - r^2)^2, whose square has the mean 1/5; over E h R^2."""
+    """m v^2/2 of two discs that move as (1 - r^2)^2, whose square's mean is 1/5; over E h R^2."""
     case = Case.from_source(DISCS | {"loading": [THROWN], "symmetry": symmetry, "mesh": mesh})
     v = 0.05 / np.sqrt(1e6 / 1000)  # over the speed of waves
     assert next(follow(Scene(case))).clock["kinetic"] == pytest.approx(

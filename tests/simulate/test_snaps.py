@@ -175,7 +175,7 @@ def test_departure_and_jump(late: float) -> None:
     )
     assert bare.endswith("(times in R √(ρ/E); with a density of the shell they are in ms).")
     (in_ms,) = _snaps({"snaps": [snap], "snap_jump_ms": 3.1, "snap_departure_ms": 28.0})
-    assert (
-        in_ms
-        == "The snap takes 3.1 ms from 10 to 90 % of its way, after a departure from the fold of 28 ms."
+    assert in_ms == (
+        "The snap takes 3.1 ms from 10 to 90 % of its way, "
+        "after a departure from the fold of 28 ms."
     )

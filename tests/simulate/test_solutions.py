@@ -57,7 +57,7 @@ def crossings(
 
 
 def test_a_roof_has_snapped_through() -> None:
-    """Sze's roof has three equilibria between its folds; the path by arc length passes all of them."""
+    """Sze's roof has three equilibria between its folds. The path by arc length passes them all."""
     result = ms.run(roof("mesh.size=127"))
     scene, found = result.scene, list(result.found.values())
     assert [row["negative_pivots"] for row in result.rows[-2:]] == [1, 0]
@@ -96,9 +96,9 @@ def test_what_a_step_holds_stays_held() -> None:
         f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5)
     )
     first = push + "control: displacement, until: target, displacement: 15.875, points: 4}"
-    second = (
-        more
-        + "control: load, until: target, factor: 1, points: 1, hold: {load: conjugate}, search: {solutions: 2}}"
+    second = more + (
+        "control: load, until: target, factor: 1, points: 1, hold: {load: conjugate}, "
+        "search: {solutions: 2}}"
     )
     settings = ["mesh={degree: 3, size: 127}", f"loading=[{first}, {second}]"]
     result = ms.run(ms.Case.load(CASES / "benchmarks/hinged_roof_6.35.yaml", settings))

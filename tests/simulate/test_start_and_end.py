@@ -17,7 +17,7 @@ QUARTIC = ["0", "0", "(1 - x**2 - y**2)**2"]
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
 def test_velocity_by_formula(symmetry: str) -> None:
-    """The kinetic energy of (1 - r^2)^2 is pi/10, over rho h R^4; it has the symmetry of the disc."""
+    """The kinetic energy of (1 - r^2)^2 is pi/10, over rho h R^4. It has the disc's symmetry."""
     step = {"kind": "time", "duration": 1e-6, "points": 1, "velocity": QUARTIC}
     found = columns_of(
         case_of(PLATE, step, symmetry=symmetry, mesh={"degree": 4, "refinement": 0.3})

@@ -372,7 +372,8 @@ def test_a_branch_goes_on_after_an_interruption_and_on_several_ranks(tmp_path: P
     case = tmp_path / "case.yaml"
     case.write_text(
         "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 30, poisson_ratio: 0.3}\n"
-        "boundary: {rim: clamped}\nloading: {kind: pressure, until: bifurcation, then: follow, points: 2}\n"
+        "boundary: {rim: clamped}\n"
+        "loading: {kind: pressure, until: bifurcation, then: follow, points: 2}\n"
     )
     one, cut = tmp_path / "one", tmp_path / "cut"
     assert magshell("run", case, "--out", one, "--no-pictures").returncode == 0
@@ -403,7 +404,8 @@ def test_results_of_a_run_that_has_handed_over(tmp_path: Path) -> None:
     """
     target = "{kind: pressure, control: load, until: target, pressure: 0.505, points: 1}"
     text = (
-        "shell: {geometry: cap, radius: 1, thickness: %r, polar: 30, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "shell: {geometry: cap, radius: 1, thickness: %r, polar: 30, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\n"
         "loading: [{kind: pressure, until: bifurcation, then: follow, points: 6}, %s]\n"
     )
     coarse = "mesh={degree: 3, refinement: 0.7}"

@@ -286,7 +286,7 @@ def test_in_parallel(half_mesh: Adapted, tmp_path: Path) -> None:
 
 
 def test_a_point_in_a_large_cell_beside_small_ones_is_found() -> None:
-    """Though the centres of a hundred small ones are nearer; each cell has its number as its value."""
+    """Though the centres of a hundred small ones are nearer. Each cell's value is its number."""
     large = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
     along = np.linspace(2.0, 8.0, 101)[:-1]
     small = [[[10 - t, t], [10 - t + 0.06, t], [10 - t, t + 0.06]] for t in along]

@@ -31,7 +31,8 @@ shell:
   youngs_modulus: 1 MPa
   poisson_ratio: 0.45
   density: 1200 kg/m^3
-  imperfections: [{kind: dimple, amplitude: 0.2 mm, width: 5 mm}, {kind: gaussian, amplitude: -0.3, width: 4}]
+  imperfections: [{kind: dimple, amplitude: 0.2 mm, width: 5 mm}, \
+{kind: gaussian, amplitude: -0.3, width: 4}]
 boundary: {rim: clamped}
 points: {A: [0, 0, 20 mm]}
 mesh: {degree: 3}
@@ -51,7 +52,8 @@ PRESSED = """
 magnetic:
   remanent: {flux_density: 80 mT}
   applied:
-    sources: [{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.2 T, position: [0, 0, -15 mm]}]
+    sources: [{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.2 T, \
+position: [0, 0, -15 mm]}]
 bodies: {ball: {kind: sphere, radius: 8 mm, at: {polar: 0}, stiffness: 1.0e+6}}
 loading: [{kind: field, points: 1}, {kind: contact, approach: 0.6 mm, points: 1}]
 """
@@ -64,7 +66,10 @@ SEALED = STATE.replace(
     "depth: 0.1 mm, points: 1}", "depth: 0.1 mm, points: 1, hold: {pressure: conjugate}}"
 )
 GAS = SEALED.replace("pressure: conjugate", "pressure: {gas: {ambient: 100 Pa}}")
-AGAIN = "  - {kind: field, factor: 1.5, points: 1, hold: {pressure: HELD, force: conjugate}}\nreactions: true\n"
+AGAIN = (
+    "  - {kind: field, factor: 1.5, points: 1, hold: {pressure: HELD, force: conjugate}}\n"
+    "reactions: true\n"
+)
 CHAIN = SEALED.replace("reactions: true\n", AGAIN.replace("HELD", "conjugate"))
 LEFT = """
 magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
@@ -203,7 +208,10 @@ def test_frequencies_where_a_body_touches() -> None:
 def test_a_conjugate_held_beside_a_body() -> None:
     """The volume is held from the first contact on, which is not the state before the step."""
     pressed = "{kind: pressure, control: load, until: target, pressure: 20 Pa, points: 1}"
-    steps = f"[{pressed}, {{kind: contact, approach: 0.3 mm, points: 1, hold: {{pressure: conjugate}}}}]"
+    steps = (
+        f"[{pressed}, {{kind: contact, approach: 0.3 mm, points: 1, "
+        "hold: {pressure: conjugate}}]"
+    )
     of_volume = adjoint(run(Scene(case_of("pressed", [f"loading={steps}"]))), "A_uz")
     with pytest.raises(
         CaseError, match=r"shell\.poisson_ratio: has no derivative where a conjugate is held beside"

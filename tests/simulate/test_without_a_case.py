@@ -143,7 +143,7 @@ def test_thickness_as_a_function(dome: Dome) -> None:
 
 
 def test_a_thickness_that_is_negative_between_the_nodes_of_the_displacement(dome: Dome) -> None:
-    """Quadratic in each triangle, one at its vertices and less than zero at the middle of a side."""
+    """Quadratic in each triangle: one at its vertices, below zero at the middle of a side."""
     thin = function(dome, ("DG", 2), lambda x: 1 + 0 * x[0])
     thin.x.array[3::6] = -0.02
     with pytest.raises(

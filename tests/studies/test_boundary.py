@@ -98,7 +98,7 @@ def test_against_runs_through_the_cusp(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_number_of_the_shape(tmp_path: Path) -> None:
-    """The drawn rise in place of the grown one, in scenes that are made again: against runs, 1e-7."""
+    """The drawn rise in place of the grown one, in scenes made again: against runs, 1e-7."""
     key = "shell.imperfections.0.amplitude"
     fixed = [f"{KEY}=1"]
     found = ms.boundary(ARCH, f"{key}=0.75:0.85:2", [*fixed, f"{key}=0.8"], tmp_path / "b")
@@ -116,7 +116,8 @@ def test_a_caps_fold_vanishes_with_the_order_three_halves(tmp_path: Path) -> Non
     """
     case = tmp_path / "cap.yaml"
     case.write_text(
-        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 12, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "shell: {geometry: cap, radius: 1, thickness: 0.01, polar: 12, poisson_ratio: 0.3}\n"
+        "boundary: {rim: clamped}\n"
         "symmetry: axisymmetric\nloading: {kind: pressure, until: limit}\n"
     )
     cusps, depths, gaps = list[float](), (10.533, 10.548), list[float]()
@@ -195,7 +196,10 @@ def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
     for start, said in (
         (
             f"{run}:0",
-            f"is no fold or bifurcation of this run; these are {located['bifurcation']} (bifurcation), ",
+            (
+                f"is no fold or bifurcation of this run; these are {located['bifurcation']} "
+                "(bifurcation), "
+            ),
         ),
         (f"{run}", "write it as DIR:POINT"),
         (f"{tmp_path}:1", "path.csv"),
@@ -346,7 +350,7 @@ def test_a_load_is_in_the_units_of_the_case(
 
 @pytest.mark.slow
 def test_a_map_of_boundaries(tmp_path: Path) -> None:
-    """On springs the arch snaps later, or not at all: each line is the boundary of its case alone."""
+    """On springs the arch snaps later, or not at all. Each line is its case's boundary."""
     over, second = f"{KEY}=1.1:1.3:2", "foundation.stiffness=1e-12,1e-9,1e-4"
     out = tmp_path / "map"
     fixed = [f"{KEY}=1.3", "loading.1.until=target", "loading.1.factor=6"]
@@ -393,8 +397,8 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
     drawn: list[Any] = []
     monkeypatch.setattr(plt, "close", drawn.append)
     content = {
-        "case": "a_map.yaml", "keys": ["shell.defect.amplitude", "magnetic.lambda_m"], "units": ["", ""],
-        "range": [0.4, 2.0], "values": [-0.004, -0.002, 0.0], "load": "pressure",
+        "case": "a_map.yaml", "keys": ["shell.defect.amplitude", "magnetic.lambda_m"],
+        "units": ["", ""], "range": [0.4, 2.0], "values": [-0.004, -0.002, 0.0], "load": "pressure",
     }  # fmt: skip
     loads = {-0.002: "pressure", -0.004: "lambda_m"}
     rows = [
@@ -517,7 +521,8 @@ def test_where_three_modes_meet_the_first_is_followed(tmp_path: Path) -> None:
     D, case = thinness**-3 / (12 * (1 - nu**2)), tmp_path / "plate.yaml"
     case.write_text(
         f"shell: {{geometry: disc, radius_to_thickness: {thinness}, poisson_ratio: {nu}}}\n"
-        f"boundary: {{rim: clamped}}\nfoundation: {{stiffness: {700 * D!r}}}\nnatural: {{stretch: {1 + growth}}}\n"
+        f"boundary: {{rim: clamped}}\nfoundation: {{stiffness: {700 * D!r}}}\n"
+        f"natural: {{stretch: {1 + growth}}}\n"
         "loading: {kind: natural, grows: stretch, until: limit}\n"
     )
     found = ms.boundary(

@@ -101,7 +101,10 @@ def test_numbers_between_bounds_and_a_constraint(
     """
     kept = "[{of: tip_ux, least: -0.2}]"
     varied = "{magnetic.lambda_m: [1.0e-5, 2.0e-4]}"
-    section = f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}, iterations: 8}}"
+    section = (
+        f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}, "
+        "iterations: 8}"
+    )
     content = design(strip(f"design: {section}\n"), out=tmp_path / "out")
     assert content["best"]["tip_ux"] == pytest.approx(-0.2, rel=1e-3)
     assert 1e-5 < content["numbers"]["magnetic.lambda_m"] < 2e-4
@@ -151,7 +154,7 @@ design:
 
 
 def test_bounds_and_results_in_units(tmp_path: Path) -> None:
-    """A field in tesla for a load in pascals: the best case, run as it is written, buckles there."""
+    """A field in tesla for a load in pascals. The best case, run as written, buckles there."""
     (tmp_path / "cap.yaml").write_text(IN_UNITS, encoding="utf-8")
     content = design(tmp_path / "cap.yaml", out=tmp_path / "out")
     assert content["verified"]["buckling_pressure_Pa"] == pytest.approx(250, rel=1e-3)
@@ -170,7 +173,10 @@ def test_bounds_and_results_in_units(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> None:
-    section = "{objective: {reach: tip_uz, value: 0.99}, numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}, iterations: 4}"
+    section = (
+        "{objective: {reach: tip_uz, value: 0.99}, "
+        "numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}, iterations: 4}"
+    )
     done = magshell("design", strip(f"design: {section}\n"), "--out", tmp_path / "out")
     assert done.returncode == 3
     assert "tip_uz = 0.99 is not reached within the bounds: the nearest found is" in done.stderr
@@ -215,7 +221,10 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ),
         (
             "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1 mT, 2 mT]}}",
-            "design.numbers: magnetic.lambda_m: is a number without a unit in the case: so are its bounds",
+            (
+                "design.numbers: magnetic.lambda_m: is a number without a unit in the case: "
+                "so are its bounds"
+            ),
         ),
         (
             "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1 mT, 2]}}",
@@ -226,11 +235,17 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
             "design.numbers: magnetic.lambd: the case has no such key (lambd)",
         ),
         (
-            "design: {objective: {minimise: tip_ux}, remanence: {points: 3, magnitude: [0.1, 0.5]}}",
+            (
+                "design: {objective: {minimise: tip_ux}, "
+                "remanence: {points: 3, magnitude: [0.1, 0.5]}}"
+            ),
             "design.remanence.magnitude: the vectors start with lengths 1 to 1, beyond 0.1 to 0.5",
         ),
         (
-            "design: {objective: {shape: {curve: [[1, 0, 0], [2, 0, 0], [3, 0, 0]]}}, remanence: {points: 3}}",
+            (
+                "design: {objective: {shape: {curve: [[1, 0, 0], [2, 0, 0], [3, 0, 0]]}}, "
+                "remanence: {points: 3}}"
+            ),
             "design.objective.shape.curve: begins at",
         ),
         (
@@ -239,10 +254,16 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ),
         (
             "design: {objective: {maximise: [tip_uz, sideways]}, remanence: {points: 3}}",
-            "strip.yaml:8: design.objective.maximise: sideways: has no gradient here; allowed are knockdown, ",
+            (
+                "strip.yaml:8: design.objective.maximise: sideways: has no gradient here; "
+                "allowed are knockdown, "
+            ),
         ),
         (
-            "design: {objective: {maximise: tip_uz}, remanence: {points: 3}, constraints: [{of: mass, same_as: side}]}",
+            (
+                "design: {objective: {maximise: tip_uz}, remanence: {points: 3}, "
+                "constraints: [{of: mass, same_as: side}]}"
+            ),
             "design.constraints.0.same_as: side: has no gradient here; allowed",
         ),
     ],
@@ -264,7 +285,10 @@ def test_strip_that_becomes_half_a_circle(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
-    wanted = "design={objective: {maximise: tip_uz}, numbers: {shell.poisson_ratio: [0, 0.3]}, iterations: 1}"
+    wanted = (
+        "design={objective: {maximise: tip_uz}, numbers: {shell.poisson_ratio: [0, 0.3]}, "
+        "iterations: 1}"
+    )
     done = magshell("design", CASES / "bracket.yaml", "--set", wanted, "--out", tmp_path)
     assert "verified (on the mesh of the file): tip_uz = -0.0001" in done.stdout
 
@@ -284,7 +308,7 @@ def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_thickness_for_the_highest_load_at_equal_mass(tmp_path: Path) -> None:
-    """1.5 times the knockdown factor of the even shell, at its mass; the finer mesh has the same."""
+    """1.5 times the even shell's knockdown factor, at its mass. The finer mesh has the same."""
     content = design(CASES / "designed_thickness.yaml", ["design.iterations=4"], tmp_path)
     assert content["start"]["knockdown"] == pytest.approx(0.326233305, rel=1e-6)
     assert content["best"]["knockdown"] > 1.5 * content["start"]["knockdown"]
@@ -412,10 +436,17 @@ def test_remanence_for_a_sensor_that_reads_most(
         np.array([30.0, 0.0, 20.0]),
         "design: {objective: {maximise: hall_Bz}, remanence: {points: 2}}\n",
     )
-    text = "sensors: {hall: {position: [30.5, 0, 20]}}\nloading: {kind: pressure, control: load, until: target"
+    text = (
+        "sensors: {hall: {position: [30.5, 0, 20]}}\n"
+        "loading: {kind: pressure, control: load, until: target"
+    )
     file = strip(f"{text}, pressure: 1.0e-9, points: 1}}\n{turned}")
-    file.write_text(file.read_text().replace("{lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}",
-                                             "{remanent: {polar: 90, flux_density: 1 T}}"))  # fmt: skip
+    file.write_text(
+        file.read_text().replace(
+            "{lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}",
+            "{remanent: {polar: 90, flux_density: 1 T}}",
+        )
+    )
     content = design(file, ["design.iterations=20"], tmp_path / "out")
     r, e = np.linalg.norm(x), np.array([0.0, 0.0, 1.0])
     way, volume = (3 * (x @ e) * x / r**2 - e) / (4 * np.pi * r**3), 0.1 * 0.01

@@ -50,7 +50,8 @@ def test_thickness_of_two_strips(tmp_path: Path) -> None:
         },
         "design": {
             "objective": {"maximise": "tip_uz"}, "iterations": 2,
-            "thickness": {"points": 4, "values": [0.8, 1.3]}, "constraints": [{"of": "mass", "most": 1}],
+            "thickness": {"points": 4, "values": [0.8, 1.3]},
+            "constraints": [{"of": "mass", "most": 1}],
         },
     }  # fmt: skip
     (tmp_path / "strips.yaml").write_text(yaml.safe_dump(case))

@@ -27,7 +27,8 @@ from magshell_fenicsx.studies.statistics import make_row
 
 DIMPLE = CASES / "dimple_buckling.yaml"
 RANDOM = (
-    "ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 1, deviation: 0.3, below: 3}, "
+    "ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 1, "
+    "deviation: 0.3, below: 3}, "
     "magnetic.lambda_m: {kind: normal, mean: 5e-4, deviation: 1e-4}}}"
 )
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
@@ -136,7 +137,10 @@ def test_a_fold_ahead_is_the_fold_of_the_path(monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_weakest_defects_are_deleted() -> None:
     """The others stay as they are."""
-    defects = "defects: {count: 4, amplitude: {kind: uniform, above: 0.5, below: 2}, width: 3, polar: [0, 60]}"
+    defects = (
+        "defects: {count: 4, amplitude: {kind: uniform, above: 0.5, below: 2}, width: 3, "
+        "polar: [0, 60]}"
+    )
     settings = (f"ensemble={{{defects}}}", *SMALL)
     (whole,), (less,) = (drawn(*settings, numbers=range(1), deleted=n) for n in (0, 2))
     every, kept = whole.case.shell.imperfections, less.case.shell.imperfections
@@ -146,7 +150,8 @@ def test_the_weakest_defects_are_deleted() -> None:
 
 
 UNITS = (
-    "shell={geometry: hemisphere, radius: 30 mm, thickness: 0.3 mm, youngs_modulus: 1 MPa, poisson_ratio: 0.5, "
+    "shell={geometry: hemisphere, radius: 30 mm, thickness: 0.3 mm, youngs_modulus: 1 MPa, "
+    "poisson_ratio: 0.5, "
     "imperfections: [{kind: gaussian, amplitude: 0.6, width: 2}, "
     "{kind: gaussian, amplitude: 0.15 mm, width: 2, at: {polar: 40}}]}"
 )
@@ -156,7 +161,10 @@ def test_defects_with_and_without_units_are_compared() -> None:
     """0.15 mm is half of the thickness, and less than 0.6 h; a drawn value with a unit is a number
     of the table.
     """
-    keys = "keys: {shell.imperfections.1.amplitude: {kind: uniform, above: 0.1, below: 0.15, unit: mm}}"
+    keys = (
+        "keys: {shell.imperfections.1.amplitude: {kind: uniform, above: 0.1, "
+        "below: 0.15, unit: mm}}"
+    )
     (sample,) = drawn(f"ensemble={{{keys}}}", UNITS, numbers=range(1))
     assert sample.severest["amplitude"] == 0.6
     row = make_row(sample, None, KNOCKDOWN)
@@ -240,7 +248,7 @@ def test_failed_samples_are_counted_and_listed(
 
 
 def test_killed_before_the_first_sample(tmp_path: Path) -> None:
-    """Only an unfinished file is there: `--resume` begins, and finds nothing of another ensemble."""
+    """Only an unfinished file is there. `--resume` begins, finding nothing of another ensemble."""
     (tmp_path / "points").mkdir()
     (tmp_path / "points" / "key.unfinished").touch()
     settings = [RANDOM, *COARSE]
@@ -281,7 +289,8 @@ def test_ranks_give_the_table_of_one(tmp_path: Path, alone: list[dict[str, str]]
         ),
         (
             [
-                "ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 50, deviation: 500}}}"
+                "ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 50, "
+                "deviation: 500}}}"
             ],
             {},
             "of seed 1; bounds keep a distribution in",

@@ -162,7 +162,7 @@ def test_an_interrupted_identification_goes_on(whole: Whole, tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
-    """Buckling pressures in two fields say modulus and remanence of a cap, without noise exactly."""
+    """Buckling pressures in two fields give a cap's modulus and remanence, exact without noise."""
     text = CAP + "symmetry: axisymmetric\n"
     text += (
         "identify: {parameters: {shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}}\n"
@@ -172,9 +172,8 @@ def test_rows_of_several_cases_and_ends_of_paths(tmp_path: Path) -> None:
     rows = [f"{key} [mT],buckling_pressure [Pa]"]
     for field in (-10, 20):
         case = ms.Case.load(file, [f"{key}={field} mT"])
-        rows.append(
-            f"{field},{float(read(ms.Scene(case), [Reading('buckling_pressure_Pa')], []).values[0])!r}"
-        )
+        pressure = read(ms.Scene(case), [Reading("buckling_pressure_Pa")], []).values[0]
+        rows.append(f"{field},{float(pressure)!r}")
     start = ["shell.youngs_modulus=1.35 MPa", "magnetic.remanent.flux_density=57 mT"]
     found = ms.identify(file, data_file(tmp_path, "\n".join(rows)), start, tmp_path / "out")
     assert found.fit.x == pytest.approx([1.3, 60.0], rel=1e-4)
@@ -285,7 +284,10 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
         (
             "applied [mT],tip_uz [mm]\n5,9\n30,14\n10,12\n",
             [],
-            r"data: --data .*measured.csv: line 3: applied_mT = 30 is outside the path, which goes from 0",
+            (
+                r"data: --data .*measured.csv: line 3: applied_mT = 30 is outside the path, "
+                r"which goes from 0"
+            ),
         ),
         (
             "applied [mT],tip_uz [mm]\n\n5,9\n\n-3,1\n10,12\n",
@@ -323,7 +325,10 @@ def test_the_posterior_of_emcee(tmp_path: Path) -> None:
         (
             "applied [mT],tip_uz [mm]\n5,9\n10,12\n15,13\n",
             ["identify.parameters={shell.youngs_modulus: {}, magnetic.remanent.flux_density: {}}"],
-            "shell.youngs_modulus and magnetic.remanent.flux_density cannot be told apart by these data",
+            (
+                "shell.youngs_modulus and magnetic.remanent.flux_density cannot be told apart "
+                "by these data"
+            ),
         ),
         (
             "applied [mT],tip_uz [mm]\n5,9\n",

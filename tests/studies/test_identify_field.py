@@ -8,7 +8,8 @@ import pytest
 from command import magshell, started
 
 CASE = """
-shell: {geometry: cap, radius: 40 mm, thickness: 0.8 mm, polar: 45, youngs_modulus: 1.3 MPa, poisson_ratio: 0.49}
+shell: {geometry: cap, radius: 40 mm, thickness: 0.8 mm, polar: 45, youngs_modulus: 1.3 MPa, \
+poisson_ratio: 0.49}
 boundary: {rim: clamped}
 magnetic: {remanent: {flux_density: 60 mT}, applied: {flux_density: 10 mT}}
 mesh: {degree: 2, refinement: 0.3}

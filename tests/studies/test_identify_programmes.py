@@ -13,7 +13,8 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 
 CAP = """
-shell: {geometry: cap, radius: 40 mm, thickness: 0.8 mm, polar: 45, youngs_modulus: 900 kPa, poisson_ratio: 0.49}
+shell: {geometry: cap, radius: 40 mm, thickness: 0.8 mm, polar: 45, youngs_modulus: 900 kPa, \
+poisson_ratio: 0.49}
 boundary: {rim: clamped}
 points: {tip: [0 mm, 0 mm, 40 mm]}
 magnetic: {remanent: {flux_density: 143 mT}, applied: {flux_density: 20 mT}}

@@ -96,7 +96,7 @@ def test_against_metropolis(deviation: float) -> None:
 
 
 def test_a_posterior_that_is_not_normal() -> None:
-    """Two deviations of a spring known to 1 % lie on a parabola, those of one known to 20 % do not."""
+    """Two deviations of a spring known to 1 % lie on a parabola. Those known to 20 % do not."""
     sure = measured(3)
     assert nonlinearity(relaxing, fit(sure))[0] < NORMAL
     y = sure.data + 14 * (sure.data - relaxing(TRUTH)[0])  # type: ignore[index]

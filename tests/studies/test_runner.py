@@ -91,7 +91,7 @@ def test_a_part_that_is_none(part: str) -> None:
 
 
 def test_the_rest_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four tasks of a minute each, by a clock of one's own: what is left is said until it is short."""
+    """Four tasks of a minute each, by one's own clock. What is left is said until it is short."""
     now = [0.0]
     monkeypatch.setattr(runner.time, "perf_counter", lambda: now[0])
     said: list[str] = []

@@ -174,7 +174,8 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     assert len(computed) == 2
     edited()
     assert again("loading.pressure=1e-5:3e-5:3") == [
-        "2 of these computed again: their files are of other sources of magshell_fenicsx, or damaged"
+        "2 of these computed again: their files are of other sources of magshell_fenicsx, "
+        "or damaged"
     ]
     assert len(computed) == 3
     assert again("loading.pressure=1e-5:3e-5:3") == []

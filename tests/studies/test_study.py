@@ -108,7 +108,10 @@ def test_results_of_the_summary() -> None:
     [
         (
             "k_d",
-            "k_d is no column with numbers; write knockdown, barrier, critical_field, snap_time, snap_dep",
+            (
+                "k_d is no column with numbers; write knockdown, barrier, critical_field, "
+                "snap_time, snap_dep"
+            ),
         ),
         ("force", "nothing is no column"),
         ("force@w=1", "w is no column"),

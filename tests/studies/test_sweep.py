@@ -284,7 +284,8 @@ def test_values_with_units_are_numbers(tmp_path: Path) -> None:
     shell = f"{{geometry: cap, polar: 60, {sizes}, poisson_ratio: 0.5, "
     file = tmp_path / "cap.yaml"
     file.write_text(
-        f"shell: {shell}defect: {{kind: dimple, amplitude: 1.64, width: 3.2}}}}\nboundary: {{rim: clamped}}\n"
+        f"shell: {shell}defect: {{kind: dimple, amplitude: 1.64, width: 3.2}}}}\n"
+        "boundary: {rim: clamped}\n"
         "magnetic: {remanent: {flux_density: 63 mT}, applied: {flux_density: 1 mT}}\n"
         "loading: {kind: pressure, until: limit}\nmesh: {degree: 3, refinement: 0.5}\n",
         encoding="utf-8",

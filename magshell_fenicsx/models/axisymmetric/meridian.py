@@ -212,8 +212,8 @@ def make_meridian(
     names
         Names of the ends along the meridian, None for the axis.
     points
-        See `Meridian`. By default there is "pole", at the parameter 0. Of several shells it is the
-        highest place or, where this is supported, the highest free one on the axis.
+        Name -> parameter s and azimuth (rad) of an observed place. By default "pole" is at 0; of
+        several shells it is the highest place or, if that is supported, the highest free one.
     curvature
         Largest curvature of the meridian times R, at least 1.
     shell_intervals
@@ -225,14 +225,7 @@ def make_meridian(
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
     intervals = [ends for _, ends in shell_intervals] or [(float(vertices[0]), float(vertices[-1]))]
-    # a cell counts if it lies within the last interval that begins before it
-    interval_of_cell = np.searchsorted(
-        [begin for begin, _ in intervals], vertices[:-1] + PARAMETER_TOLERANCE
-    )
-    is_cell = (
-        vertices[:-1]
-        < np.array([end for _, end in intervals])[interval_of_cell - 1] - PARAMETER_TOLERANCE
-    )
+    is_cell = _is_in_interval(vertices, intervals)
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
         MPI.COMM_SELF,
@@ -241,13 +234,8 @@ def make_meridian(
         e=element,
     )
     domain.topology.create_connectivity(0, 1)
-    facets = [
-        mesh.locate_entities_boundary(
-            domain, 0, lambda x, end=end: np.abs(x[0] - end) < PARAMETER_TOLERANCE
-        )
-        for ends in intervals
-        for end in ends
-    ]
+    # the facet of each end, in the order of `names`
+    facets = [_facets_at_end(domain, end) for ends in intervals for end in ends]
     poles = [facet for name, facet in zip(names, facets, strict=True) if not name]
     axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
@@ -262,6 +250,26 @@ def make_meridian(
     middles = domain.geometry.x[compat.geometry_dofs(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in shell_intervals}
     return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
+
+
+def _is_in_interval(vertices: Array, intervals: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:
+    """Return whether each step (n - 1,) from a vertex to the next is a cell of an interval.
+
+    It is one if it lies within the last interval that begins before it; other steps lead from one
+    shell to the next.
+    """
+    interval_of_cell = np.searchsorted(
+        [begin for begin, _ in intervals], vertices[:-1] + PARAMETER_TOLERANCE
+    )
+    ends = np.array([end for _, end in intervals])
+    return np.asarray(vertices[:-1] < ends[interval_of_cell - 1] - PARAMETER_TOLERANCE)
+
+
+def _facets_at_end(domain: mesh.Mesh, end: float) -> NDArray[np.int32]:
+    """Return the facet at an end of a meridian, by its parameter, as an array (1,)."""
+    return np.asarray(
+        mesh.locate_entities_boundary(domain, 0, lambda x: np.abs(x[0] - end) < PARAMETER_TOLERANCE)
+    )
 
 
 def _highest_parameter(embedding: Embedding, vertices: Array, supported: Sequence[float]) -> float:
@@ -328,28 +336,52 @@ def graded_vertices(
     A point force bends the shell like s^2 log s. On the axis the cells shrink to a thickness
     whatever the refinement: the logarithmic stretch under an ideal point has no limit.
     """
-    # tuned for that accuracy: size of a cell on the axis, its growth along s, and the largest size
-    smallest, growth = h, 0.3 / refinement
-    largest = min(0.2 * sqrt(h), largest) / refinement
-
-    def size(s: Array) -> Array:
-        """Return the wanted size of cells at parameters s (n,): the least that any feature asks.
-
-        It grows linearly with the distance from the axis and from the place of contact.
-        """
-        if everywhere is not None:
-            return np.full_like(s, everywhere / refinement)
-        sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
-        if contact_size:
-            contact_reach, size_in_contact = contact_size
-            sizes = np.minimum(
-                sizes, size_in_contact / refinement + growth * np.maximum(0.0, s - contact_reach)
-            )
-        return sizes
-
+    if everywhere is not None:
+        size = _CellSize(everywhere / refinement)
+    else:
+        # tuned for that accuracy: the largest size, that on the axis, and the growth along s
+        largest = min(0.2 * sqrt(h), largest) / refinement
+        on_axis, growth = h if axis else None, 0.3 / refinement
+        contact = (contact_size[0], contact_size[1] / refinement) if contact_size else None
+        size = _CellSize(largest, on_axis, growth, contact)
     lines = line_coordinates(np.array(circles), lambda s: float(size(np.array([s]))[0]), (0.0, end))
     corners = [0.0, *lines, end]
     return _equidistributed(corners, size)
+
+
+@dataclass(frozen=True)
+class _CellSize:
+    """The wanted size of cells along a meridian: the least that any feature asks for.
+
+    Attributes
+    ----------
+    largest
+        The largest size.
+    on_axis
+        Size on the axis, at s = 0; None if the surface has no point there.
+    growth
+        Growth of the size per distance from the axis, and from the place of contact.
+    contact
+        Distance from the start within which bodies press, and the size there; None without bodies.
+    """
+
+    largest: float
+    on_axis: float | None = None
+    growth: float = 0.0
+    contact: tuple[float, float] | None = None
+
+    def __call__(self, s: Array) -> Array:
+        """Return the sizes (n,) at parameters s (n,)."""
+        if self.on_axis is None:
+            sizes = np.full_like(s, self.largest)
+        else:
+            sizes = np.minimum(self.on_axis + self.growth * s, self.largest)
+        if self.contact:
+            contact_reach, size_in_contact = self.contact
+            sizes = np.minimum(
+                sizes, size_in_contact + self.growth * np.maximum(0.0, s - contact_reach)
+            )
+        return sizes
 
 
 def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -> Array:

@@ -65,6 +65,8 @@ class WaveHessians:
         symmetric.
     _batches, _sums
         The batches of entities, and for each the matrix that adds its blocks up into entries.
+    _nodes
+        (cells, functions) node of each shape function of a cell.
     """
 
     def __init__(
@@ -155,6 +157,16 @@ class _WaveBatch:
         The wave number.
     _given, _varying
         For each energy: its parameters at points; the point fields among these, with their values.
+    _kernels
+        For each energy the kernel of its Hessian by the wave's coefficients and their derivatives,
+        whose entries are the upper triangle at each point.
+    _scales
+        (points, entries) factors of the Hessians: weights of the quadrature, and factors that turn
+        derivatives by the reference coordinate into those by the meridian's.
+    _order, _products
+        Positions of the Hessians' entries at all points of an entity, sorted as the rows of
+        `_products`: the products of derivatives of two shape functions at these points. The sorted
+        entries times the products give the matrix of the entity.
     """
 
     def __init__(
@@ -213,11 +225,13 @@ class _WaveBatch:
         ]
         if not active_energies:
             return None
+        # the kernels' inputs: jets of u and of the placements, and fields of the densities
         fill(self._at_u, self._derivatives(self._u))
         self._placed.renew()
         for number in active_energies:
             for target, values in self._varying[number]:
-                fill(target, values.renew()[0])
+                (values_on_batch,) = values.renew()
+                fill(target, values_on_batch)
         # upper triangles of the Hessians by the wave's jets; pi is the integral of cos² around e3,
         # as of sin²
         upper = np.zeros((len(waves), *self._scales.shape))
@@ -336,6 +350,7 @@ class _WaveBatch:
         They are (points of an entity, derivatives, functions).
         """
         element = self._u.function_space.element.basix_element
+        # the rule has its points in the reference cell of each side
         return [element.tabulate(2, X)[..., 0].transpose(1, 0, 2) for X in self._batch.rule.points]
 
     @cached_property

@@ -224,19 +224,11 @@ def refine_where_hidden(
     while True:
         is_own = parts.cell < owned
         part_count = max(part_count, comm.allreduce(int(is_own.sum())))
-        area = samples.area * is_own
-        integral = comm.allreduce(area @ samples.values.mean(axis=1))
-        mean = integral / comm.allreduce(float(area.sum()))
-        f = samples.values - mean
-        size = np.linalg.norm(f, axis=-1)
-        variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
-        largest = comm.allreduce(float(np.abs(samples.values).max(initial=0.0)), MPI.MAX)
-        can_hide = (samples.hidden > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
-        hidden_integrals = np.where(can_hide, samples.area * samples.hidden, 0.0)
+        deviations, variation = _deviations(samples, is_own, comm)
+        hidden_integrals = _hidden_integrals(samples, comm)
         largest_hidden = comm.allreduce(float(hidden_integrals[is_own].max(initial=0.0)), MPI.MAX)
         hidden_integral = comm.allreduce(float(hidden_integrals[is_own].sum()))
-        own_integral = float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
-        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(own_integral)
+        negligible = MAX_OPEN_INTEGRAL * _integral_of_size(samples, is_own, comm)
         threshold = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(is_own.sum())), 1)
         # parts that hide more than their share, the worst of them first
         to_divide = (hidden_integrals > threshold) & (
@@ -250,17 +242,47 @@ def refine_where_hidden(
         parts = SubCells.concatenate([parts[~to_divide], smaller])
         new_samples = _sample(formulas, smaller, places_of, lattice)
         samples = _Samples.concatenate([samples.select(~to_divide), new_samples])
-    variances = (size**2).mean(axis=1)
+    variances = (deviations**2).mean(axis=1)
     share = hidden_integral / max(variation, np.finfo(float).tiny)
+    open_share = share if part_count > MAX_PARTS else 0.0
     return RefinedParts(
-        parts,
-        samples.area,
-        samples.centre,
-        samples.size,
-        variances,
-        variation,
-        share if part_count > MAX_PARTS else 0.0,
+        parts, samples.area, samples.centre, samples.size, variances, variation, open_share
     )
+
+
+def _deviations(
+    samples: "_Samples", is_own: NDArray[np.bool_], comm: MPI.Comm
+) -> tuple[Array, float]:
+    """Return |f - mean of f| at the samples (parts, places), and its integral; collective.
+
+    Mean and integral are those over the parts of all ranks; `is_own` (parts,) tells which parts of
+    this rank count.
+    """
+    area = samples.area * is_own
+    integral = comm.allreduce(area @ samples.values.mean(axis=1))
+    mean = integral / comm.allreduce(float(area.sum()))
+    deviations = np.linalg.norm(samples.values - mean, axis=-1)
+    return deviations, comm.allreduce(float((area * deviations.mean(axis=1)).sum()))
+
+
+def _hidden_integrals(samples: "_Samples", comm: MPI.Comm) -> Array:
+    """Return the hidden integral of each part (parts,); collective.
+
+    It is zero where `hidden` is negligible beside the largest value, or the part is tiny.
+    """
+    largest = comm.allreduce(float(np.abs(samples.values).max(initial=0.0)), MPI.MAX)
+    can_hide = (samples.hidden > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
+    return np.where(can_hide, samples.area * samples.hidden, 0.0)
+
+
+def _integral_of_size(samples: "_Samples", is_own: NDArray[np.bool_], comm: MPI.Comm) -> float:
+    """Return the integral of |f| over the parts of all ranks, by samples; collective.
+
+    `is_own` (parts,) tells which parts of this rank count.
+    """
+    area = samples.area * is_own
+    own_integral = float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
+    return float(comm.allreduce(own_integral))
 
 
 @dataclass(frozen=True)
@@ -303,8 +325,14 @@ def _sample(
     """Sample formulas in each part, and estimate how far they may leave the range of the samples.
 
     Ranges of the formulas, and of their slopes, are taken in the box around a part's places. The
-    box is enlarged for a curved part, which bulges out of it. `places_of` and `lattice` are as in
-    `refine_where_hidden`.
+    box is enlarged for a curved part, which bulges out of it.
+
+    Parameters
+    ----------
+    places_of
+        Function from parts to their places (parts, q, 3), the corners first, and areas (parts,).
+    lattice
+        The same places in the reference cell, with pairs of neighbours.
     """
     x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
@@ -322,7 +350,8 @@ def _sample(
     # the range beyond most of the samples' range, but not more than slopes allow between places
     beyond_samples = np.maximum(upper - lower - STEP_SHARE * np.ptp(f, axis=1), 0.0)
     hidden = np.minimum(beyond_samples, slope_range / lattice.count)
-    # nothing is hidden if slopes vary about as much as the samples show
+    # nothing is hidden if slopes vary about as much as the samples show: `bent` is the range of
+    # slopes between neighbouring samples
     is_shown = slope_range <= SLOPE_RATIO * lattice.bent(f)
     hidden = np.where(is_shown, 0.0, hidden).sum(axis=1)
     return _Samples(area, x.mean(axis=1), (high - low).max(axis=1), hidden, f)

@@ -45,8 +45,10 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
 
     One half of the shell has the displacement u + v, the other is the mirror image of a half with u
     - v. `m` is the edge's covector, `width` that of the cells there, `sigma` the penalty and
-    `mirror` the unit normal of the plane, as in `edges.symmetric`.
+    `mirror` the unit normal of the plane. `natural` are the forms of the shape that the shell would
+    have without stress; None for those of r0.
     """
+    # components of the edge's unit conormal, and the edge's length over its parameter
     nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirrored(a: Expr) -> Expr:
@@ -63,7 +65,8 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
         return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
 
     sides = (u + v, u - v)
-    # a natural shape has another kink at the edge than r0
+    # the jump over that without stress: a natural shape has another kink at the edge than r0, by
+    # the ratio `natural.kink`
     deformed_jump = jump(r0 + sides[0], r0 + sides[1])
     J = deformed_jump - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)
     # moments across the edge and penalty stiffnesses on both sides
@@ -84,6 +87,8 @@ class AntisymmetricModes:
     ----------
     system
         The system of the antisymmetric modes, at displacements of the half model.
+    _factorisation, _factored
+        Factors of the latest tangent, and the state to which they belong; None before the first.
     """
 
     label = "antisymmetric"

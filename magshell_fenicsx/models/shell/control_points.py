@@ -85,8 +85,8 @@ class ControlledPattern:
     values
         (n, 3) vectors at the points; (n, 2) along e_rho and e_z if the field turns about e3.
     frame
-        (3, 3) axes of the points' frame as columns, see `spatial_fields.Components`; None for the
-        model's own frame.
+        (3, 3) axes of the points' frame in that of the model, as columns; None for the model's own
+        frame.
     """
 
     controls: ControlPoints

@@ -53,6 +53,7 @@ def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | No
     is the jet of the displacement of the variation. It gives a tangent another membrane stress than
     the one at u.
     """
+    # the metric of v has the components v_i . v_j
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     present, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
@@ -87,13 +88,16 @@ def normal_moment(
     components of the undeformed unit conormal nu.
     """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
+    # `edge`: inverse metric, components of nu with index up, and the square of nu
     if natural is None:
-        edge = kin.inverse_metric(r0), (nu1, nu2), 1  # nu has the length 1
+        edge = kin.inverse_metric(r0), (nu1, nu2), 1
         return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
-    # nu with index down by the undeformed metric, then up by the natural one
+    # nu with index down by the undeformed metric, then up by the natural one, in which its length
+    # is not one
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
     covector_up = ufl.dot(natural.up, covector)
     edge = natural.up, (covector_up[0], covector_up[1]), ufl.dot(covector_up, covector)
+    # strain and change of curvature from the natural shape, and the law with its thickness
     E, K, law = E - natural.strain, K - natural.bend, law.thicker(natural.thickness)
     return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, *edge)
 

@@ -14,7 +14,8 @@ exchange of '+' and '-'.
 - m is the covector (2,) of an edge (`kinematics.conormal`); an edge's parameter is its length in
   the coordinates, or a number from 0 to 1.
 - h_e is the `width` of the cells at the edge, sigma the penalty, D a bending stiffness.
-- A natural shape (`Forms`) is the one that the shell would have without stress.
+- A natural shape (`Forms`) is the one that the shell would have without stress. Its `kink(nu)` is
+  its curvature across an edge over the undeformed one, `along(nu)` the square of its stretch there.
 - A jet is a field's value with its first and second derivatives.
 """
 
@@ -102,9 +103,10 @@ def two_sided(
     natural
         The natural forms on both sides; None if they are those of r0.
     """
+    # on each side the conormal's two components, and the edge's length over its parameter
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
-    # a conormal has two components and the stretch of the edge
     stretch = (conormals[0][2] + conormals[1][2]) / 2
+    # moment across the edge and stiffness for the penalty on each side, then their means
     moments = [
         densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i])
         for i in range(2)
@@ -126,6 +128,7 @@ def interior(
     It is per unit of the edge's parameter. The jump of the normal stands for the angle, whose sine
     it is. `rest` are the width and sigma of `two_sided`.
     """
+    # the two components of the conormal on each side
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J0 = fold_jump(*r0, *nus)
     if natural:  # a natural shape has another kink at the edge: the mean ratio of both sides
@@ -196,11 +199,13 @@ def clamped(
 ) -> Expr:
     """Energy of a clamped edge, per unit of its parameter.
 
-    The side '-' is rigid: its normal stays n0, or is `turn` n0 with a rotation (3, 3). Other
-    parameters are those of `two_sided`, on one side.
+    The side '-' is rigid: its normal stays n0, or is `turn` n0 with a rotation (3, 3). There are
+    jets, covector, law and natural forms of one side only; `width` is that of its cells, `sigma`
+    the penalty.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
+    # the jump -[n] . r_nu from the held normal to that of the shell
     held_normal = n0 if turn is None else ufl.dot(turn, n0)
     J = -ufl.dot(held_normal - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
@@ -221,7 +226,8 @@ def symmetric(
     """Energy of an edge on a mirror plane, per unit of its parameter.
 
     It is half of the energy of an interior edge whose side '-' is the mirror image of '+'. `mirror`
-    is the unit normal of the plane; other parameters are those of `two_sided`, on one side.
+    is the unit normal of the plane. There are jets, covector, law and natural forms of one side
+    only; `width` is that of its cells, `sigma` the penalty.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 

@@ -68,8 +68,9 @@ class HessianIntegral:
     log
         Log of compiled kernels.
     prestress
-        `densities.prestress` as a density: the second variation under an additional membrane
-        stress, for `replace_strain`. None if the strain is never replaced.
+        The second variation under an additional membrane stress as a density, for `replace_strain`.
+        Its first parameter that varies is the additional strain. None if the strain is never
+        replaced.
 
     Attributes
     ----------
@@ -86,6 +87,8 @@ class HessianIntegral:
         Whether `replace_strain` has been called for the next `add`.
     _coupled, _contractions
         Pairs of jet parts that any term couples, and their contraction for each quadrature rule.
+    _points, _dofs, _sides
+        Storage of the kernels' inputs, nodes (cells, functions) of the cells, and `sides`.
     """
 
     def __init__(
@@ -150,7 +153,7 @@ class HessianIntegral:
             Factors of terms by name; terms without a factor are left out.
         element_matrices
             (local cells, 9, pairs a <= b of functions), to which the matrices are added: six
-            symmetric and three skew parts of each block (3, 3), see `BlockMatrix.add_cells`.
+            symmetric and three skew parts of each block (3, 3).
         couple
             Is called for each batch of interior edges, with its number and the matrices that couple
             the two cells at its edges.

@@ -107,7 +107,8 @@ class Density:
             Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
-        # jets and covectors: a pair of both sides, or the value of the only side
+        # arguments in the order of `function`: jets, then on edges the covectors and the width,
+        # then parameters. Jets and covectors are a pair of both sides, or the value of the only one
         covectors = edge[:1] if edge else ()
         sided = [
             tuple(side_values) if self.sides == 2 else side_values[0]
@@ -134,6 +135,7 @@ def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """Turn a density per undeformed area into one per area of the coordinates."""
 
     def density_per_coordinates(r0: Jet, *rest: Any, **options: Any) -> Expr:
+        """Return the density times the area of the surface per area of the coordinates."""
         return density(r0, *rest, **options) * kin.area_ratio(r0)
 
     return density_per_coordinates
@@ -245,6 +247,7 @@ def constants_of(
     """
 
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
+        """Return a number or a vector as a constant on the mesh."""
         return fem.Constant(domain, np.asarray(value, dtype=float))
 
     def constant_or_field(

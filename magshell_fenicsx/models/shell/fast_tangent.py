@@ -76,7 +76,7 @@ class ElementIntegral(Protocol):
 
 
 class FastTangent:
-    """The tangent of a sum of terms; an `assembly.terms.TangentAssembler`.
+    """The tangent of a sum of terms, assembled from element matrices.
 
     Parameters
     ----------
@@ -94,6 +94,8 @@ class FastTangent:
     ----------
     _moving, _moving_integrals
         Both parts of `moving`; None and empty without moving nodes.
+    _u, _integrals, _nodes
+        `u`, `integrals`, and the nodes (cells, functions) of the cells.
     _matrix
         The matrix, to which element matrices are added.
     _element_matrices
@@ -153,7 +155,8 @@ class FastTangent:
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         element_matrices = np.zeros(self._element_matrices.shape)
         for integral in self._moving_integrals:
-            # products of coupled cells are added at once, those within cells after the loop
+            # products of coupled cells are added at once, those within cells after the loop. The
+            # default value binds the integral of this pass
 
             def couple(batch: int, K: Array, integral: ElementIntegral = integral) -> None:
                 """Add the products of matrices K that couple the two cells at each edge."""
@@ -198,8 +201,8 @@ def hessian_integrals(
     log
         Log of compiled kernels.
     prestress
-        Density with which the membrane stress can be exchanged, see `HessianIntegral`. Terms with a
-        quadrature of their own do not have it.
+        Density of the second variation under an additional membrane stress, with which the stress
+        can be exchanged. Terms with a quadrature of their own do not have it.
     cell_mask
         Flags (local cells,) of the cells that count, with their edges; None for all.
     """

@@ -20,7 +20,7 @@ the degree k, p is f.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import basix
@@ -165,6 +165,8 @@ def project_formula(
 ) -> ProjectedFormula:
     """Return a formula on cells: its interpolant, or polynomials with the same moments; collective.
 
+    Only cells in which the interpolant is off, or which hide detail, get polynomials.
+
     Parameters
     ----------
     values
@@ -176,32 +178,16 @@ def project_formula(
     degree
         Degree of the polynomials with the same moments, at most that of the element.
     bounded
-        Whether the polynomials stay between the least and the largest value in a cell; of their
-        moments only the first is then kept.
+        Whether polynomials stay in the range of f in each cell; only the first moment is then kept.
     formulas
         Formulas that vary, whose ranges show what happens between the places; None without.
-
-    Notes
-    -----
-    Only cells in which the interpolant is off, or which hide detail, get new polynomials.
     """
-    X, weights = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
-    x, normals, area_ratio = cells.evaluate(X)
-    f = values(x, normals)
-    interpolated = np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal)
-    interpolation_error = np.linalg.norm(interpolated - f, axis=-1)
-    magnitude, area = np.linalg.norm(f, axis=-1), area_ratio * weights
-    sizes = (area * magnitude).sum(axis=1)
-    errors = (area * interpolation_error).sum(axis=1)
-    squares = (area * magnitude**2).sum(axis=1)
-    sums = cells.sum_over_ranks(np.stack([sizes, errors, squares], axis=-1))
-    size, total_error, total_square = map(float, sums)
-    scale = area.sum(axis=1) / weights.sum()
+    samples = _sample_cells(values, cells, nodal, element)
+    size, total_error, total_square = samples.totals(cells)
+    # what the integrals from these samples miss in each cell
+    scale, detail = samples.scale, _HiddenDetail.without_detail(len(cells.nodal))
     if formulas:
-        # integrals over the reference cell from samples, which the parts' integrals may contradict
-        detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", weights, f))
-    else:
-        detail = _HiddenDetail.without_detail(len(scale))
+        detail = _find_hidden_detail(values, formulas, cells, samples.reference_integrals)
     hidden_by_cell = scale * detail.hidden
     hidden_integral = float(cells.sum_over_ranks(hidden_by_cell))
     size += hidden_integral
@@ -209,57 +195,205 @@ def project_formula(
     hides_detail = hidden_integral > INTERPOLATION_TOLERANCE * detail.variation
     if not (is_off or hides_detail):
         return ProjectedFormula(nodal, smooth=True, size=size, open=detail.open)
-    largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
-    projected_cells = np.flatnonzero(
-        (interpolation_error @ weights > SMOOTH_CELL_TOLERANCE * largest * weights.sum())
-        | (hidden_by_cell > PART_TOLERANCE * size)
-    )
+    # the cells that get polynomials, and the parts with which their integration begins
+    threshold = PART_TOLERANCE * size
+    projected_cells = np.flatnonzero(samples.is_off(cells.comm) | (hidden_by_cell > threshold))
     first_parts = detail.parts_of(projected_cells, _uniform_parts(cells))
-    space = basix.create_element(
+    space, rule = _polynomial_space(element, degree), _PartRule.of_cells(values, cells)
+    integrals = _moments(
+        rule, projected_cells, scale, first_parts, threshold, space, nodal.shape[-1]
+    )
+    polynomials = _CellPolynomials.with_moments(space, degree, integrals.moments)
+    at_nodes = polynomials.at(element.points)
+    if bounded:
+        at_nodes = polynomials.bounded(at_nodes, samples.X, samples.f[projected_cells])
+    new_nodal = nodal.copy()
+    new_nodal[projected_cells] = at_nodes
+    formula = ProjectedFormula(new_nodal, smooth=False, size=size, open=detail.open)
+    return _with_errors(
+        formula, cells, samples, projected_cells, integrals, polynomials, total_square
+    )
+
+
+def _polynomial_space(element: Element, degree: int) -> Element:
+    """Return the Lagrange element of a degree on the cells of another element."""
+    return basix.create_element(
         basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
     )
-    moments, sizes[projected_cells], reference_squares, missed = _moments(
-        values,
-        cells,
-        projected_cells,
-        scale,
-        first_parts,
-        PART_TOLERANCE * size,
-        space,
-        nodal.shape[-1],
-    )
-    Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
-    phi = space.tabulate(0, Y)[0, :, :, 0]
-    # p with these moments: mass matrix of the reference cell (rule Y, v) times p = moments
-    coefficients = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
+
+
+def _with_errors(
+    formula: ProjectedFormula,
+    cells: CellGeometry,
+    samples: "_CellSamples",
+    projected_cells: Numbers,
+    integrals: "_Moments",
+    polynomials: "_CellPolynomials",
+    total_square: float,
+) -> ProjectedFormula:
+    """Return a projected formula with its size and with the errors that are left; collective.
+
+    Parameters
+    ----------
+    samples
+        The formula at samples of all cells.
+    projected_cells, integrals, polynomials
+        Numbers of the cells with polynomials p, the integrals of f over these, and p.
+    total_square
+        Integral of |f|^2 from samples.
+    """
+    sizes, squares, scale = samples.sizes, samples.squares, samples.scale
+    sizes[projected_cells] = integrals.sizes
+    # integral of |f|^2 less that of |p|^2: as p is an orthogonal projection of f, this is that of
+    # |f - p|^2, but for rounding
+    lost_squares = integrals.squares - polynomials.squares
     residual_squares = np.zeros(len(scale))
-    # integral of |f|² less that of |p|²: p is an orthogonal projection of f
-    lost_squares = reference_squares - np.einsum("q,cqi->c", v, np.matmul(phi, coefficients) ** 2)
     residual_squares[projected_cells] = scale[projected_cells] * np.maximum(lost_squares, 0.0)
     size = float(cells.sum_over_ranks(sizes))
     total_residual = float(cells.sum_over_ranks(residual_squares))
+    # the largest side of a cell that leaves a visible part of the residual
     side = np.sqrt(2.0) * scale ** (1 / min(cells.dimension, 2))
     visible_sides = side[residual_squares > VISIBLE_SHARE * total_residual]
     widest = cells.comm.allreduce(float(visible_sides.max(initial=0.0)), MPI.MAX)
-    at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], coefficients)
-    if bounded:
-        mean = np.einsum("q,cqi->ci", v, np.matmul(phi, coefficients))[:, None] / v.sum()
-        at_samples = np.matmul(space.tabulate(0, X)[0, :, :, 0], coefficients)
-        at_nodes = _bounded(at_nodes, mean, at_samples, f[projected_cells])
-    new_nodal = nodal.copy()
-    new_nodal[projected_cells] = at_nodes
-    squares[projected_cells] = scale[projected_cells] * reference_squares
+    squares[projected_cells] = scale[projected_cells] * integrals.squares
     smallest_positive = np.finfo(float).tiny  # for a formula that is zero but on a line
     largest_square = max(total_square, float(cells.sum_over_ranks(squares)), smallest_positive)
-    return ProjectedFormula(
-        new_nodal,
-        smooth=False,
+    return replace(
+        formula,
         size=size,
-        missed=missed / max(size, smallest_positive),
+        missed=integrals.error / max(size, smallest_positive),
         rest=float(np.sqrt(total_residual / largest_square)),
         widest=widest,
-        open=detail.open,
     )
+
+
+@dataclass(frozen=True)
+class _CellSamples:
+    """A formula f at quadrature points of all cells, and how far its interpolant is off there.
+
+    Attributes
+    ----------
+    X, weights
+        (q, d) and (q,): the rule on the reference cell.
+    f, magnitude
+        (cells, q, components) values, and (cells, q) their norms.
+    error
+        (cells, q) norm of the interpolant less f.
+    area
+        (cells, q) weights times the sizes of the cells over that of the reference cell.
+    """
+
+    X: Array
+    weights: Array
+    f: Array
+    magnitude: Array
+    error: Array
+    area: Array
+
+    @property
+    def sizes(self) -> Array:
+        """(cells,) integral of |f|."""
+        return np.asarray((self.area * self.magnitude).sum(axis=1))
+
+    @property
+    def errors(self) -> Array:
+        """(cells,) integral of |interpolant - f|."""
+        return np.asarray((self.area * self.error).sum(axis=1))
+
+    @property
+    def squares(self) -> Array:
+        """(cells,) integral of |f|^2."""
+        return np.asarray((self.area * self.magnitude**2).sum(axis=1))
+
+    def totals(self, cells: CellGeometry) -> tuple[float, float, float]:
+        """Return the sums of `sizes`, `errors` and `squares` over the cells of all ranks."""
+        sums = cells.sum_over_ranks(np.stack([self.sizes, self.errors, self.squares], axis=-1))
+        size, error, square = map(float, sums)
+        return size, error, square
+
+    @property
+    def reference_integrals(self) -> Array:
+        """(cells, components) integral of f over the reference cell, from these samples."""
+        return np.asarray(np.einsum("q,cqi->ci", self.weights, self.f))
+
+    @property
+    def scale(self) -> Array:
+        """(cells,) size of each cell over that of the reference cell."""
+        return np.asarray(self.area.sum(axis=1) / self.weights.sum())
+
+    def is_off(self, comm: MPI.Comm) -> NDArray[np.bool_]:
+        """Return whether the interpolant is off in each cell (cells,), by the mean of its error.
+
+        It is compared with the largest |f| on all ranks; collective.
+        """
+        largest = comm.allreduce(float(self.magnitude.max(initial=0.0)), MPI.MAX)
+        allowed = SMOOTH_CELL_TOLERANCE * largest * self.weights.sum()
+        return np.asarray(self.error @ self.weights > allowed)
+
+
+def _sample_cells(
+    values: Values, cells: CellGeometry, nodal: Array, element: Element
+) -> _CellSamples:
+    """Return samples of a formula in all cells, with the error of its interpolant `nodal`."""
+    X, weights = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
+    x, normals, area_ratio = cells.evaluate(X)
+    f = values(x, normals)
+    interpolated = np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal)
+    error = np.linalg.norm(interpolated - f, axis=-1)
+    magnitude, area = np.linalg.norm(f, axis=-1), area_ratio * weights
+    return _CellSamples(X, weights, f, magnitude, error, area)
+
+
+@dataclass(frozen=True)
+class _CellPolynomials:
+    """Polynomials p on some cells.
+
+    Attributes
+    ----------
+    space
+        Element of the functions on the reference cell.
+    coefficients
+        (cells, functions, components) of p.
+    weights, at_points
+        (q,) and (cells, q, components): weights of a rule, and p at its points.
+    """
+
+    space: Element
+    coefficients: Array
+    weights: Array
+    at_points: Array
+
+    @classmethod
+    def with_moments(cls, space: Element, degree: int, moments: Array) -> "_CellPolynomials":
+        """Return the polynomials of a degree with moments (cells, functions, components)."""
+        Y, v = basix.make_quadrature(space.cell_type, 2 * degree)
+        phi = space.tabulate(0, Y)[0, :, :, 0]
+        # mass matrix of the reference cell (rule Y, v) times p = moments
+        coefficients = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
+        return cls(space, coefficients, v, np.matmul(phi, coefficients))
+
+    def at(self, X: Array) -> Array:
+        """Return p at reference points X (n, d), (cells, n, components)."""
+        return np.asarray(np.matmul(self.space.tabulate(0, X)[0, :, :, 0], self.coefficients))
+
+    @property
+    def squares(self) -> Array:
+        """(cells,) integral of |p|^2 over the reference cell."""
+        return np.asarray(np.einsum("q,cqi->c", self.weights, self.at_points**2))
+
+    def bounded(self, at_nodes: Array, X: Array, f: Array) -> Array:
+        """Return the values of p at nodes, contracted to the range of f in each cell.
+
+        Parameters
+        ----------
+        at_nodes
+            (cells, nodes, components) values of p.
+        X, f
+            Reference points (n, d) of samples, and the formula there, (cells, n, components).
+        """
+        v = self.weights
+        mean = np.einsum("q,cqi->ci", v, self.at_points)[:, None] / v.sum()
+        return _bounded(at_nodes, mean, self.at(X), f)
 
 
 def _uniform_parts(cells: CellGeometry) -> SubCells:
@@ -291,7 +425,7 @@ class _HiddenDetail:
     parts, is_divided
         Parts of divided cells, and flags (cells,) of the cells that are divided.
     open
-        See `ProjectedFormula`.
+        Part of the integral of |f| that samples may have missed, if it is more than allowed.
     """
 
     hidden: Array
@@ -372,111 +506,149 @@ def _find_hidden_detail(
     return _HiddenDetail(differences, refined.variation, parts, is_divided, refined.open)
 
 
+@dataclass(frozen=True)
+class _PartSamples:
+    """A formula at the quadrature points of some parts of cells.
+
+    Attributes
+    ----------
+    X, f
+        (parts, q, d) points in the reference cell, and (parts, q, components) values there.
+    weights, area
+        (parts, q) weights for integrals over the reference cell, and over the surface.
+    """
+
+    X: Array
+    weights: Array
+    area: Array
+    f: Array
+
+    @property
+    def integrals(self) -> Array:
+        """(parts, components) integral of f over each part, in the reference cell."""
+        return np.asarray(np.einsum("pq,pqi->pi", self.weights, self.f))
+
+    def select(self, flags: NDArray[np.bool_]) -> "_PartSamples":
+        """Return the samples of selected parts, by flags (parts,)."""
+        return _PartSamples(self.X[flags], self.weights[flags], self.area[flags], self.f[flags])
+
+
+@dataclass(frozen=True)
+class _PartRule:
+    """A quadrature rule on parts of cells, for a formula.
+
+    Attributes
+    ----------
+    values, cells
+        The formula as a function of places and normals, and the cells.
+    points, weights
+        The rule on the reference cell.
+    """
+
+    values: Values
+    cells: CellGeometry
+    points: Array
+    weights: Array
+
+    @classmethod
+    def of_cells(cls, values: Values, cells: CellGeometry) -> "_PartRule":
+        """Return the rule for parts of cells of their dimension."""
+        degree = RULE_DEGREE[cells.dimension]
+        return cls(values, cells, *basix.make_quadrature(cells.element.cell_type, degree))
+
+    def samples(self, parts: SubCells) -> _PartSamples:
+        """Return the formula at the points of the rule on each part."""
+        X, w = parts.rule(self.points, self.weights)
+        x, normals, area_ratio = self.cells.evaluate(X, parts.cell)
+        return _PartSamples(X, w, area_ratio * w, self.values(x, normals))
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """Integrals of a formula f over some cells.
+
+    Attributes
+    ----------
+    moments
+        (cells, functions, components) of f times each function, over the reference cell.
+    sizes, squares
+        (cells,) of |f| over the surface, and of |f|^2 over the reference cell.
+    error
+        Estimated error of the integrals over the surface, of all ranks.
+    """
+
+    moments: Array
+    sizes: Array
+    squares: Array
+    error: float = 0.0
+
+    def add(self, rows: Numbers, samples: _PartSamples, space: Element) -> None:
+        """Add integrals over parts to those of their cells, which stand in the `rows` (parts,)."""
+        if not len(rows):  # Basix tabulates no empty set of points
+            return
+        X, w, f = samples.X, samples.weights, samples.f
+        size = np.linalg.norm(f, axis=-1)
+        phi = space.tabulate(0, X.reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
+            *size.shape, space.dim
+        )
+        part_moments = np.matmul(np.swapaxes(w[..., None] * phi, 1, 2), f)
+        np.add.at(self.moments, rows, part_moments)
+        np.add.at(self.sizes, rows, (samples.area * size).sum(axis=1))
+        np.add.at(self.squares, rows, (w * size**2).sum(axis=1))
+
+
 def _moments(
-    values: Values,
-    cells: CellGeometry,
+    rule: _PartRule,
     projected_cells: Numbers,
     scale: Array,
     first_parts: SubCells,
     threshold: float,
     space: Element,
     components: int,
-) -> tuple[Array, Array, Array, float]:
-    """Integrate f times polynomials over cells, by parts that are divided as far as needed.
+) -> _Moments:
+    """Integrate f times the functions of a space over cells, by parts; collective.
 
-    A part is divided until its integral agrees with the sum over its own parts, whose integrals are
-    then added up. Collective.
+    A part is divided until its integral agrees with the sum over its own parts, the children. Then
+    the integrals over these are added to those of the cell.
 
     Parameters
     ----------
-    values, cells
-        See `project_formula`.
-    projected_cells
-        Numbers of the cells.
     scale
         (all cells,) size of each cell over that of the reference cell.
-    first_parts
-        Parts with which the division begins.
     threshold
-        Largest difference of a part's integral, over the surface, from that of its own parts.
-    space
-        Element of the functions in the moments.
+        Largest difference of a part's integral, over the surface, from that of its children.
     components
         Number of components of f.
-
-    Returns
-    -------
-    moments
-        (projected cells, functions, components): integrals of f times each function of the space,
-        over the reference cell.
-    sizes, squares
-        (projected cells,): integral of |f| over the surface, and of |f|^2 over the reference cell.
-    error
-        Estimated error of the integrals over the surface, of all ranks.
     """
-    points, weights = basix.make_quadrature(space.cell_type, RULE_DEGREE[cells.dimension])
-    # row of each projected cell in the results
-    number = np.zeros(len(cells.nodal), np.int64)
-    number[projected_cells] = np.arange(len(projected_cells))
-
-    def evaluated(batch: SubCells) -> tuple[Array, Array, Array, Array]:
-        """Return points X, weights w, weights times area ratios, and values f in each part.
-
-        Sums with w are integrals over the reference cell, sums with the third over the surface.
-        """
-        X, w = batch.rule(points, weights)
-        x, normals, area = cells.evaluate(X, batch.cell)
-        return X, w, area * w, values(x, normals)
-
-    def integrals(w: Array, f: Array) -> Array:
-        """Return the integrals (parts, components) of f over the parts, in the reference cell."""
-        return np.asarray(np.einsum("pq,pqi->pi", w, f))
-
-    moments = np.zeros((len(projected_cells), space.dim, components))
-    sizes = np.zeros(len(projected_cells))
-    squares = np.zeros(len(projected_cells))
-    errors = 0.0
-    children = len(CHILDREN[cells.dimension])
-    coarse_integrals = [integrals(w, f) for _, w, _, f in map(evaluated, first_parts.batches())]
+    cells, count = rule.cells, len(projected_cells)
+    row_of_cell = np.zeros(len(cells.nodal), np.int64)
+    row_of_cell[projected_cells] = np.arange(count)
+    result = _Moments(np.zeros((count, space.dim, components)), np.zeros(count), np.zeros(count))
+    parts, children, errors = first_parts, len(CHILDREN[cells.dimension]), 0.0
+    # integrals over the parts themselves, by batches
+    integrals = [rule.samples(batch).integrals for batch in parts.batches()]
     for depth in range(MAX_DIVISIONS + 1):
-        is_last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(first_parts.cell)) > MAX_PARTS
+        is_last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(parts.cell)) > MAX_PARTS
         divided_parts, divided_integrals = list[SubCells](), list[Array]()
-        for batch, batch_integrals in zip(first_parts.batches(), coarse_integrals, strict=True):
+        for batch, batch_integrals in zip(parts.batches(), integrals, strict=True):
             smaller = batch.divided()
-            X, w, area, f = evaluated(smaller)
-            child_integrals = integrals(w, f)
-            # difference of a part's integral from the sum over its own parts
-            error = scale[batch.cell] * np.linalg.norm(
-                child_integrals.reshape(len(batch_integrals), children, -1).sum(axis=1)
-                - batch_integrals,
-                axis=1,
-            )
+            samples = rule.samples(smaller)
+            child_integrals = samples.integrals
+            sums = child_integrals.reshape(len(batch_integrals), children, -1).sum(axis=1)
+            error = scale[batch.cell] * np.linalg.norm(sums - batch_integrals, axis=1)
             converged = (error <= threshold) | is_last
             errors += float((error[converged & (batch.cell < cells.owned)] ** 2).sum())
             is_added = np.repeat(converged, children)
-            cell_numbers = number[smaller.cell[is_added]]
-            size = np.linalg.norm(f[is_added], axis=-1)
-            if len(cell_numbers):  # Basix tabulates no empty set of points
-                phi = space.tabulate(0, X[is_added].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
-                    *size.shape, space.dim
-                )
-                np.add.at(
-                    moments,
-                    cell_numbers,
-                    np.matmul(np.swapaxes(w[is_added][..., None] * phi, 1, 2), f[is_added]),
-                )
-                np.add.at(sizes, cell_numbers, (area[is_added] * size).sum(axis=1))
-                np.add.at(squares, cell_numbers, (w[is_added] * size**2).sum(axis=1))
+            result.add(row_of_cell[smaller.cell[is_added]], samples.select(is_added), space)
             divided_parts.append(smaller[~is_added])
             divided_integrals.append(child_integrals[~is_added])
-        first_parts = SubCells.concatenate(divided_parts) if divided_parts else first_parts
-        if not cells.comm.allreduce(len(first_parts.cell)):
+        parts = SubCells.concatenate(divided_parts) if divided_parts else parts
+        if not cells.comm.allreduce(len(parts.cell)):
             break
         all_integrals = np.concatenate([np.empty((0, components)), *divided_integrals])
-        coarse_integrals = [
-            all_integrals[i : i + BATCH_SIZE] for i in range(0, len(all_integrals), BATCH_SIZE)
-        ]
-    return moments, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
+        starts = range(0, len(all_integrals), BATCH_SIZE)
+        integrals = [all_integrals[i : i + BATCH_SIZE] for i in starts]
+    return replace(result, error=float(np.sqrt(cells.comm.allreduce(errors))))
 
 
 def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Array:

@@ -74,8 +74,9 @@ class PointGradient:
     r0
         Jets (points, sides * parts * 3) of the placement, in the cells' own coordinates.
     geometry
-        (points, 4): `cell_frames`; on edges (points, 6 sides + 1): the frame of each side, the
-        covectors of the edge in the sides' own coordinates (see `kinematics.conormal`), the width.
+        (points, 4): p, q, s and the determinant of the cell's frame. On edges (points, 6 sides +
+        1): the frame of each side, the covectors (2,) of the edge in the sides' own coordinates,
+        and the width of the cells.
     values
         Function from a field that a density depends on to its values (points, components).
     log
@@ -93,6 +94,10 @@ class PointGradient:
         The energy of each term, and the virtual works of loads without potential.
     _conservative
         The energies of terms that have no virtual work.
+    _points, _chunks
+        Storage of the point fields, and slices of all points, one for each chunk.
+    _names, _energies
+        Names of the terms, and the kernels of their energies that have been made, by name.
     """
 
     def __init__(
@@ -139,7 +144,8 @@ class PointGradient:
     @cached_property
     def gradient(self) -> PointKernel | None:
         """Kernel of the gradient of the terms' sum, for `evaluate`; None if none depends on u."""
-        # energies are differentiated by u, virtual works by v
+        # energies are differentiated by u, virtual works by v; what does not depend on that field
+        # is left out
         sums = [
             (sum(self._conservative, ufl.zero()), self._u),
             (sum(self._work, ufl.zero()), self._v),
@@ -218,8 +224,8 @@ def _field_values(field: fem.Function, values: Callable[[fem.Function], Array]) 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
     """Return a jet in the cell's own coordinates, from one in reference coordinates.
 
-    `frame` has p, q, s of `cell_frames`: d/dx = p d/dX and d/dy = q d/dX + s d/dY. Parts are UFL
-    expressions or arrays.
+    `frame` begins with p, q and s: d/dx = p d/dX and d/dy = q d/dX + s d/dY, with the cell's own
+    coordinates x, y and those of the reference cell X, Y. Parts are UFL expressions or arrays.
     """
     p, q, s = frame[:3]
     return Jet(
@@ -257,12 +263,14 @@ def _energy(
     parameters
         The density's parameters at points.
     """
+    placement, *displacements = fields
+    # frames and jets on each side
     sides = range(density.sides)
     frames = [[point_geometry[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
-    r0_jets = [_jet(fields[0], side, parts) for side in sides]
+    r0_jets = [_jet(placement, side, parts) for side in sides]
     displacement_jets = [
         [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
-        for f in fields[1:]
+        for f in displacements
     ]
     # the determinant in the frame turns an area of the flat cell into one of the reference cell
     if not density.on_edges:

@@ -232,8 +232,12 @@ class Edge:
 
     @classmethod
     def of(cls, r0: Jet, m: Expr) -> Edge:
-        """Return the edge with the covector m, see `conormal`, on a surface with the jet r0."""
+        """Return the edge with the covector m (2,) on a surface with the jet r0.
+
+        The covector is zero along the edge and positive outward, in the coordinates of jets.
+        """
         nu1, nu2, stretch = conormal(r0, m)
+        # (-m_2, m_1) is along the edge, with the length `stretch`
         t1, t2 = -m[1] / stretch, m[0] / stretch
         return cls(
             r0.r1 * nu1 + r0.r2 * nu2, r0.r1 * t1 + r0.r2 * t2, (nu1, nu2), (t1, t2), stretch

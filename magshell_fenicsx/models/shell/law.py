@@ -446,7 +446,7 @@ def elastic_density(
     """
 
     def by_side(value: Any) -> Sequence[Any]:
-        """Return a field's values on all sides in a sequence; one side has its bare value."""
+        """Return a field's values on all sides as a sequence; of one side a bare value is given."""
         return value if density.sides == 2 else [value]
 
     def with_law(*arguments: Expr, **keywords: Any) -> Expr:
@@ -455,7 +455,8 @@ def elastic_density(
         The arguments are first the density's own, then the numbers of the law, then thickness and
         materials if there are such fields.
         """
-        # taken off from the end: the materials on all sides, then the thickness
+        # fields are taken off from the end: the materials on all sides, then the thickness; what is
+        # left ends with the numbers of the law
         arguments_left, factors, materials = list(arguments), [1] * density.sides, None
         if cell_materials is not None:
             materials = by_side(arguments_left.pop())

@@ -76,10 +76,10 @@ class Ogden(Incompressible):
 
         For each term it is mu/alpha (l1^alpha + l2^alpha + l3^alpha - 3), by z = d^(alpha/4).
         """
-        surface, total = Stretched(E, up), 0.0
+        surface, total = Stretched(E, up), 0.0  # the invariants T, D and d of the strain
         for mu, alpha in self.terms:
             z = surface.d ** (alpha / 4)
-            V, _, _ = _chebyshev(alpha / 2, _uneven(surface))
+            V, _, _ = _chebyshev(alpha / 2, w=_uneven(surface))
             # 2 z (1 + V) + 1/z² - 3, rearranged
             total = total + mu / alpha * ((z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V)
         return self.modulus_factor * self.thickness_factor * total
@@ -124,7 +124,8 @@ class Ogden(Incompressible):
             equibiaxial = equibiaxial + 4 * a * m * (
                 (a - 1 + softening / 2) * z + (a + 1 - softening / 2) / z**2
             )
-        # the factor of det K from the stiffness to bending in one direction and in all directions
+        # the factor of det K from the stiffness to bending in one direction and in all directions;
+        # below, surface.up is the determinant of the undeformed inverse metric
         uniaxial = trace_factor + y * mixed_factor + square_factor
         det_factor = 2 * uniaxial**2 / (uniaxial + equibiaxial)
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * surface.d)

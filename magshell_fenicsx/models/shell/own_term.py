@@ -188,6 +188,7 @@ class OwnTerm:
         ValueError
             With the name of the term and what is allowed.
         """
+        # what is given besides the densities
         if not self.name.isidentifier():
             raise ValueError(f"{self.name!r}: a term's name is an identifier, such as foundation")
         if not isinstance(self.value, Real) or not isfinite(self.value):
@@ -200,6 +201,7 @@ class OwnTerm:
             raise ValueError(
                 f"{self.name}: only observes: a value or a Free parameter needs a density"
             )
+        # the first density as an expression: a scalar that is made of its arguments alone
         if self._symbolic.W.ufl_shape:
             raise ValueError(
                 f"{self.name}: a density is a scalar; this has the shape "
@@ -212,6 +214,7 @@ class OwnTerm:
                 "The position is r0.r, a number that is the same everywhere goes into the "
                 "parameters"
             )
+        # what the energy depends on: the displacement and its first derivatives
         if self.density and not self.parts:
             raise ValueError(f"{self.name}: the density does not depend on the displacement")
         if self.density and (curved := [part for part in self.parts if part in SECOND_DERIVATIVES]):
@@ -290,6 +293,7 @@ class OwnTerm:
         """
 
         def function_of(p: Any) -> Any:
+            """Return the function in place of a parameter, or the parameter itself."""
             if isinstance(p, FormulaParameter):
                 return formula_to_function(p)
             return field_to_function(p) if field_to_function and isinstance(p, UserField) else p
@@ -433,11 +437,12 @@ class OwnTerm:
         turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 
         def mirrors(mirror: Mirror) -> bool:
+            """Return whether a plane mirrors the densities and all formulas."""
             return self.mirrored(mirror) and all(
                 p.mirrored(mirror, outline) for p in self.formula_parameters
             )
 
-        # an axisymmetric model also has every plane through e3 as a mirror
+        # an axisymmetric model also has every plane through e3 as a mirror, such as y = 0
         is_shared = self.mirrored(Y0_PLANE) and turns
         name = self.name + (" or what it observes" if self.observed else "")
         return SymmetryConstraint(
@@ -525,7 +530,8 @@ class OwnTerm:
         ValueError
             With the density that differs.
         """
-        # columns of the densities; the energy's density, if there is one, has none: ""
+        # columns of the densities, for messages. That of the energy has none (""), and is left out
+        # where the term has no energy
         columns = ("", *self.observed)[-len(self.densities) :]
         for column, density in zip(columns, self.densities, strict=True):
             for sample in _random_samples()[:COORDINATE_SAMPLES]:

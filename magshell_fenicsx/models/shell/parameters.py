@@ -100,7 +100,8 @@ class Material:
             return Laminated.from_laminate(self.laminate, self.h, self.nu)
         if isinstance(self.rubber, tuple):
             mu, alpha = self.rubber
-            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)  # its own number is not used
+            # the second argument, the number of a law, is not used by Ogden's law
+            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property
@@ -116,7 +117,7 @@ class Material:
         """
         if cells is None:
             return self.law
-        # with an axis (cells, 1), so that they multiply values at points; the density is not used
+        # each is (cells, 1), to multiply values at points; the density is not used
         modulus_factor, nu, _, law_number = np.moveaxis(cells[:, None], -1, 0)
         return self.law.with_material(modulus_factor, nu, law_number)
 
@@ -169,7 +170,7 @@ class EdgeForce:
 
 @dataclass(frozen=True)
 class EdgeMoment:
-    """A moment per length over E h R on a named edge; see `edges.turning`."""
+    """A moment per length over E h R on a named edge, about the edge's tangent."""
 
     edge: str
     moment: float

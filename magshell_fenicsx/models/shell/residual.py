@@ -7,11 +7,16 @@ added to a vector. The derivatives of both by free parameters are computed in th
   parts have the names in `JET_NAMES`.
 - r0 is the placement, u the displacement; W is a density, an energy per area or length.
 - Nodal values are (cells, functions * 3): the displacements at the nodes of each cell.
+- Element vectors are (cells, functions * 3) too: the derivatives of energies by nodal values.
 - Factors are the numbers that multiply the terms, by name.
 - An amplitude is a load parameter, by name, that multiplies a term; None stands for the factor 1.
-- The frame of a cell are four numbers (`cell_frames`) that turn derivatives by reference
-  coordinates into derivatives in orthonormal coordinates of the cell.
-- A `Memo` holds a value that is computed again when its inputs change.
+- The frame of a cell are four numbers p, q, s and area (`cell_frames`). With X, Y the reference
+  coordinates, d/dx = p d/dX and d/dy = q d/dX + s d/dY are derivatives in orthonormal coordinates
+  of the cell; area is the Jacobian determinant.
+- An edge has one side on the boundary, and two between cells.
+- A kernel is a compiled function of the values at points. Points are evaluated in chunks (slices),
+  since the arrays of a kernel have room for one chunk.
+- A `Memo` holds a value that is computed again when its inputs change: `renew` returns it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -73,7 +78,8 @@ class _ResidualPart(Protocol):
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         """Add the element vectors (cells, functions * 3) of terms to `elements`.
 
-        `factors` are by name; a term without one is left out. `nodal` is as in `energy`.
+        `factors` are by name; a term without one is left out. `nodal` (cells, functions * 3) are
+        the displacements of all local cells.
         """
 
 
@@ -99,6 +105,10 @@ class FastResidual:
     ----------
     names
         Names of the terms.
+
+    The field `_parts` has the groups of terms that are evaluated together. `_nodes` (cells,
+    functions) are the nodes of u in each cell; `_dofs` are the numbers of their components in the
+    order of the element vectors.
     """
 
     def __init__(
@@ -115,7 +125,7 @@ class FastResidual:
         cell_terms = [term for term in terms if not term.density.on_edges]
         edge_terms = [term for term in terms if term.density.on_edges]
 
-        def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
+        def kernel_key(term: PointTerm) -> tuple[int | None, str | None, str]:
             """Return a key: terms on cells with equal keys share a kernel.
 
             It is the degree of the quadrature (None for the usual one), the amplitude and, if each
@@ -124,11 +134,11 @@ class FastResidual:
             return term.density.quadrature, term.amplitude, term.name if one_by_one else ""
 
         residual_parts: list[_ResidualPart] = []
-        for kind_of_terms in dict.fromkeys(map(kind, cell_terms)):
-            terms_of_kind = [term for term in cell_terms if kind(term) == kind_of_terms]
-            quadrature, _, _ = kind_of_terms
+        for key in dict.fromkeys(map(kernel_key, cell_terms)):  # each key once, in order
+            terms_of_kernel = [term for term in cell_terms if kernel_key(term) == key]
+            quadrature, _, _ = key
             residual_parts.append(
-                _CellTerms(r0, quadrature or cell_quadrature(degree), terms_of_kind, log)
+                _CellTerms(r0, quadrature or cell_quadrature(degree), terms_of_kernel, log)
             )
         if edge_terms:
             residual_parts.append(_EdgeTerms(r0, edge_quadrature(degree), edge_terms, log))
@@ -147,7 +157,8 @@ class FastResidual:
 
         The first call is collective: kernels are compiled.
         """
-        return next(part for part in self._parts if name in part.names).energy(self._nodal(), name)
+        part_with_term = next(part for part in self._parts if name in part.names)
+        return part_with_term.energy(self._nodal(), name)
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
         """Add the residual at the present u to the local vector b (ghosts included).
@@ -156,7 +167,7 @@ class FastResidual:
         compiled.
         """
         nodal = self._nodal()
-        elements = np.zeros_like(nodal)
+        elements = np.zeros_like(nodal)  # element vectors, to which all parts add
         for part in self._parts:
             part.add(nodal, factors, elements)
         b += np.bincount(self._dofs, elements.ravel(), len(b))
@@ -190,12 +201,14 @@ class _CellTerms:
     _sampling
         From nodal values to jets at points, and from gradients at points to element vectors.
     _points
-        The densities and their gradients at the points.
+        The densities and their gradients at the points: `gradient` and `energy(name)` are kernels,
+        `input_array(chunk)` is the array in which they find the jets of u at a chunk of points.
     """
 
     def __init__(
         self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
     ) -> None:
+        """Prepare the sampling of u at the points of the owned cells, and the kernels there."""
         V = r0.function_space
         self.names = [term.name for term in terms]
         reference_points, self._weights = cell_rule(degree)
@@ -236,7 +249,8 @@ class _CellTerms:
         if (kernel := self._points.energy(name)) is None:
             return 0.0
         total = 0.0
-        for chunk, _ in self._filled(nodal):
+        for chunk, _ in self._chunks_with_displacement(nodal):
+            # (cells of the chunk, points) the density at the points of each cell
             values = self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights))
             total += float(np.sum(values @ self._weights))
         return total
@@ -249,14 +263,14 @@ class _CellTerms:
         factor = factors.get(self.names[0], 0.0)
         if not factor or (kernel := self._points.gradient) is None:
             return
-        for chunk, cells in self._filled(nodal):
+        for chunk, cells in self._chunks_with_displacement(nodal):
             gradients = self._points.evaluate(chunk, kernel)
             elements[cells] += factor * self._sampling.at_nodes(gradients)
 
-    def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
+    def _chunks_with_displacement(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
         """Yield each chunk of points and its cells, as slices.
 
-        The derivatives of u at the chunk's points are in the kernels' input when it is yielded.
+        When a chunk is yielded, the jets of u at its points are in the input of the kernels.
         """
         points_per_cell = len(self._weights)
         for chunk in self._points.chunks():
@@ -283,11 +297,15 @@ class _EdgeTerms:
 
     Attributes
     ----------
+    _weights
+        Weights of the quadrature on an edge.
     _width
         Number of components of a jet.
-    _displacement_jets, _back
-        (points of all cells' edges, `_width`): derivatives of u, and gradients of the energy by
-        them.
+    _sampling
+        From nodal values to jets at the points of all cells' edges, and from gradients there to
+        element vectors.
+    _displacement_jets, _gradients
+        (points of all cells' edges, `_width`): the jets of u, and gradients of the energy by them.
     _points_of_terms
         Name of a term -> rows (points, sides) of its points among these, and its density there.
     """
@@ -295,12 +313,10 @@ class _EdgeTerms:
     def __init__(
         self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
     ) -> None:
+        """Prepare the sampling of u on the edges of all cells, and the kernels of each term."""
         V = r0.function_space
         self.names = [term.name for term in terms]
-        # the points of the three edges one after the other; all edges have the same weights
-        rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
-        reference_points = np.concatenate([points for points, _ in rules])
-        _, self._weights = rules[0]
+        reference_points, self._weights = _rule_on_three_edges(degree)
         points_per_edge, all_weights = len(self._weights), np.tile(self._weights, 3)
         table = ShapeTable.tabulate(V.element.basix_element, reference_points)
         jet_parts = _jet_parts_of(terms, ALL_DERIVATIVES)
@@ -309,42 +325,51 @@ class _EdgeTerms:
             table, all_weights, [JET_NAMES.index(part) for part in jet_parts]
         )
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        self._displacement_jets, self._back = (
+        self._displacement_jets, self._gradients = (
             np.empty((len(cells) * len(reference_points), self._width)) for _ in range(2)
         )
         self._points_of_terms = dict[str, tuple[NDArray[np.intp], PointGradient]]()
+        # of each term the rows of its points, and the geometry there
+        rows_and_geometry = {
+            term.name: _points_on_edges(V, term.density, frames, points_per_edge) for term in terms
+        }
 
         def placements() -> dict[str, Array]:
             """Return the placement's jets (points, sides * parts * 3) of each term, by name.
 
             They are computed on all cells' edges at once, then picked for each term.
             """
-            all_cells = _placement(r0, table, frames, jet_parts).reshape(-1, self._width)
-            return {name: _on_sides(all_cells, rows) for name, (rows, _) in points_of_terms.items()}
+            all_jets = _placement(r0, table, frames, jet_parts).reshape(-1, self._width)
+            return {
+                name: _on_sides(all_jets, rows) for name, (rows, _) in rows_and_geometry.items()
+            }
 
-        points_of_terms = {
-            term.name: _points_on_edges(V, term.density, frames, points_per_edge) for term in terms
-        }
-        all_placements = Memo(placements, lambda: (r0.x.array,))
+        def inputs() -> tuple[Array]:
+            """Return the array whose change makes placements outdated."""
+            return (r0.x.array,)
 
-        def placements_on(name: str) -> Array:
-            """Return the latest placement's jets at the points of the named term."""
-            return all_placements.renew()[name]
-
+        all_placements = Memo(placements, inputs)
         for term in terms:
-            rows, geometry = points_of_terms[term.name]
+            rows, geometry = rows_and_geometry[term.name]
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 """Return a field's values (points, sides * components) at the points of a term."""
                 return _on_sides(at_points(field, reference_points, cells), rows)
 
-            at_cells = Memo(partial(placements_on, term.name), lambda: (r0.x.array,))
             points = PointGradient(
-                [term], jet_parts, points_per_edge, len(rows), at_cells, geometry, values, log
+                [term],
+                jet_parts,
+                points_per_entity=points_per_edge,
+                count=len(rows),
+                r0=Memo(partial(lambda name: all_placements.renew()[name], term.name), inputs),
+                geometry=geometry,
+                values=values,
+                log=log,
             )
             self._points_of_terms[term.name] = rows, points
 
     def begin(self, *, energies: bool) -> None:
+        """Begin to compile the gradients' kernels; with `energies`, those of energies too."""
         # reading a kernel begins its compilation; the values are not used here
         for name, (_, points) in self._points_of_terms.items():
             _ = points.gradient, points.energy(name) if energies else None
@@ -355,25 +380,27 @@ class _EdgeTerms:
         _, points = self._points_of_terms[name]
         kernel, total = points.energy(name), 0.0
         for _, values in self._evaluated(name, kernel):
-            total += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
+            at_edges = values.reshape(-1, len(self._weights))  # (edges of the chunk, points)
+            total += float(np.sum(at_edges @ self._weights))
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         """Add the element vectors of the terms that have a factor to `elements`.
 
-        Gradients at points of edges are collected in `_back`, by cell. One product with the shape
-        functions then turns those of all terms into element vectors.
+        The gradients of all terms at points of edges are added in `_gradients`, where each side of
+        an edge has the rows of its own cell. One product with the shape functions then turns them
+        into element vectors.
         """
         active = [name for name in self.names if factors.get(name)]
         if not active:
             return
         self._sampling.at_points(nodal, self._displacement_jets)
-        self._back[:] = 0
+        self._gradients[:] = 0
         for name in active:
             _, points = self._points_of_terms[name]
             for numbers, values in self._evaluated(name, points.gradient):
-                self._back[numbers] += factors[name] * values.reshape(-1, self._width)
-        elements += self._sampling.at_nodes(self._back)
+                self._gradients[numbers] += factors[name] * values.reshape(-1, self._width)
+        elements += self._sampling.at_nodes(self._gradients)
 
     def _evaluated(
         self, name: str, kernel: PointKernel | None
@@ -392,6 +419,16 @@ class _EdgeTerms:
             kernel_input = points.input_array(chunk).reshape(len(numbers), -1)
             np.take(self._displacement_jets, numbers, axis=0, out=kernel_input, mode="clip")
             yield numbers, points.evaluate(chunk, kernel)
+
+
+def _rule_on_three_edges(degree: int) -> tuple[Array, Array]:
+    """Return points (3 n, 2) on the reference triangle's edges, and weights (n,) on one edge.
+
+    The points of the three edges come one after the other; all edges have the same weights.
+    """
+    rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
+    _, weights = rules[0]
+    return np.concatenate([points for points, _ in rules]), weights
 
 
 def _jet_parts_of(terms: Sequence[PointTerm], always: Sequence[str]) -> list[str]:
@@ -463,10 +500,11 @@ def _points_on_edges(
     order = np.where(is_reversed[:, None], forwards[::-1, None], forwards[:, None])
     first_of_edge = points_per_edge * (3 * cells + edges)
     rows = first_of_edge[:, None] + order
-    # covectors of the reference triangle's edges, taken to the cells' own coordinates
+    # covectors of the reference triangle's edges (two components), taken to the cells' own
+    # coordinates as derivatives are; they are normal to the edge and as long as it
     p, q, s, area = frames[cells].transpose(2, 0, 1)
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
-    m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
+    m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)
     width = edge_width(V, tuple(cells.T), edges[:, 0])
     # all points of an edge have the same geometry
     columns = [
@@ -492,7 +530,8 @@ class ParameterDerivative:
     density
         Derivative of the density.
     points
-        Computes its integral and residual.
+        Computes its integral and residual. It is set after the object is made, since the
+        derivatives of several terms share it.
     """
 
     name: str
@@ -529,12 +568,12 @@ def point_parameters(
     parameters = {}
     for name, p in constants.items():
         term_slopes = slopes(p, terms, f"by {name}", serve)
-        # the derivatives of several terms may share a residual: each is compiled once
+        # derivatives of several terms may share a residual, of which the compilation begins once
         for residual in {id(slope.points): slope.points for slope in term_slopes}.values():
             residual.begin()
-        parameters[name] = FreeParameter(
-            p, term_slopes, partial(slopes, terms=term_slopes, words="twice", serve=serve)
-        )
+        # a function of another constant q, which gives the derivatives of these terms by q
+        slopes_by_another = partial(slopes, terms=term_slopes, words="twice", serve=serve)
+        parameters[name] = FreeParameter(p, term_slopes, slopes_by_another)
     return parameters
 
 
@@ -551,10 +590,10 @@ def slopes(
         ParameterDerivative(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
         for term in terms_with_p
     ]
-    points = serve(derivatives) if derivatives else None
-    for slope in derivatives:
-        assert points
-        slope.points = points
+    residual = serve(derivatives) if derivatives else None  # one for all of them
+    for derivative in derivatives:
+        assert residual
+        derivative.points = residual
     return derivatives
 
 
@@ -569,7 +608,7 @@ def derivative_by(density: Density, p: fem.Constant) -> Density:
 
         The parameter p may stand at several positions among these: one variable takes all of them.
         """
-        # the parameters are the last arguments
+        # the positions of p among the arguments, of which the parameters are the last ones
         first = len(arguments) - len(density.parameters)
         positions = [first + i for i, q in enumerate(density.parameters) if q is p]
         variable = ufl.variable(arguments[positions[0]])

@@ -20,6 +20,10 @@ docs/theory.md, Rubber.
 - The energy of bending is a quadratic form in a^ij K_ij (deformed trace), tr K (undeformed trace)
   and det K.
 - A covector c (2,) at an edge is its unit conormal.
+- The factors of modulus and thickness, which multiply energies and stresses, are those of shells
+  whose material or thickness varies.
+- Tensors are arrays or expressions with two last indices; components are the numbers 11, 12, 22.
+  The adjugate of S has the components S22, -S12, S11; it is the derivative of det S.
 """
 
 from abc import abstractmethod
@@ -60,6 +64,7 @@ class Incompressible(Law):
         T has the derivative 2 a0^ij by E_ij, D has 4 det(up) times the adjugate of E.
         """
         surface = Stretched(E, up)
+        # derivatives of the energy of stretching by T and by D
         by_T, by_D = (
             self.modulus_factor * self.thickness_factor * slope for slope in self._slopes(surface)
         )
@@ -74,6 +79,7 @@ class Incompressible(Law):
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         """Return the energy of bending, a quadratic form in a^ij K_ij, tr K and det K."""
         surface = Stretched(E, up)
+        # factors of T², -T tau, -det K and tau² in twice the energy
         square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
         T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
@@ -84,6 +90,7 @@ class Incompressible(Law):
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         """Return M with indices up, the derivative of `bending` by K."""
         surface = Stretched(E, up)
+        # factors of T², -T tau, -det K and tau² in twice the energy
         square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
         T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
         # derivatives of the energy by both traces
@@ -123,6 +130,7 @@ class Incompressible(Law):
         The determinant of c (x) c is zero, so that its factor is not needed.
         """
         surface = Stretched(E, up)
+        # factors of T², -T tau and tau² in twice the energy
         square_factor, mixed_factor, _, trace_factor = self._stiffness(surface)
         (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
         # the deformed trace of c (x) c; the undeformed one is the square of c
@@ -169,8 +177,9 @@ class Rubber(Incompressible):
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
         """Return the derivatives by T and D of ((1 - s)(I1 - 3) + s (I2 - 3))/6.
 
-        The slopes of I1 and I2 are found times d, which is divided out at the end.
+        The slopes of I1 and I2 are found times d = 1 + T + D, which is divided out at the end.
         """
+        # pairs: times d the derivatives by T and D of I1, then of I2
         first_slopes = 2 * surface.T + surface.D - surface.first, surface.T - 1 - surface.first
         second_slopes = (
             2 * (surface.d - 1) - surface.second,
@@ -187,10 +196,10 @@ class Rubber(Incompressible):
 
         Here T = a^ij K_ij with the deformed inverse metric a^ij.
         """
-        # h^2/(12 d) times 4/6 and 1/d
+        # h^2/(12 d) of the energy of bending, times 4/6 and 1/d of W''
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
         first_share, second_share, trace_of_C = 1 - self.parameter, self.parameter, 2 + surface.T
-        # W'' has d^2 in place of the root
+        # the part of W'' that multiplies det K is changed: W'' itself has d^2 in place of the root
         det_factor = first_share + second_share * (trace_of_C - root(surface.d))
         return (
             factor * 2 * (first_share + second_share * trace_of_C),
@@ -209,8 +218,10 @@ class Stretched:
         tr C - 2, det(C - 1) and det C = 1 + T + D.
     first, second
         I1 - 3 and I2 - 3, in which no numbers of order one are subtracted.
-    up, inverse
-        det up, and the inverse of the deformed metric: 11, 12, 22.
+    up
+        The determinant of the undeformed inverse metric.
+    inverse
+        Components 11, 12, 22 of the inverse of the deformed metric.
     """
 
     def __init__(self, E: Tensor, up: Tensor) -> None:

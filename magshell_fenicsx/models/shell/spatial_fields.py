@@ -6,8 +6,13 @@ In: a pattern and a placement. Out: a discontinuous finite-element field on the 
   remanence, a load or, with one component, a factor. Places are over R.
 - The placement r0 maps the flat mesh, or the mesh of a meridian, to the undeformed surface.
 - A smooth pattern is interpolated. A formula that varies within a cell is projected: the field has
-  the formula's moments in the cell (`formula_projection`).
+  the formula's moments in the cell (`formula_projection`). The result, a `ProjectedFormula`, has
+  the `nodal` values, the flag `smooth` (the pattern was interpolated in all cells), and `size`: the
+  integral of the formula's length over all cells.
 - The nodes of a discontinuous field belong to one cell each: (cells, nodes, components).
+- Facets are the edges of triangles; boundary facets have one cell. The local number of a facet in
+  its cell is 0, 1 or 2.
+- Owned cells come first on each rank, ghosts after them.
 - A rim is the edge of a dimple; a patch is a named part of the mesh.
 """
 
@@ -58,6 +63,7 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
     def __init__(
         self, V: fem.FunctionSpace, name: str, rebuild: Callable[[fem.Function], fem.Function]
     ) -> None:
+        """Make a field that is zero; the caller sets its values."""
         super().__init__(V, name=name)
         self.rebuild = rebuild
 
@@ -113,6 +119,7 @@ class Components:
 
     @property
     def formulas(self) -> FormulaGroup | None:
+        """Those of the components that are formulas of the case; None without any."""
         return formula_group(self.of_position, self.frame)
 
 
@@ -128,6 +135,7 @@ class WithinRims:
     outer_vector: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        """Return the vectors (cells, nodes, size) at places (cells, nodes, 3); n0 is not used."""
         centre = r0.mean(axis=1)
         # in reversed order, so that the vector of the first rim is written last
         vectors = np.tile(self.outer_vector, (len(r0), 1))
@@ -138,7 +146,10 @@ class WithinRims:
 
 @dataclass(frozen=True)
 class ByPatch:
-    """Pattern of one vector for each cell of this rank: `vectors` (cells, size), with ghosts."""
+    """Pattern of one vector for each cell of this rank: `vectors` (cells, size), with ghosts.
+
+    It may be called with the places of owned cells alone, which come first.
+    """
 
     vectors: Array
 
@@ -180,6 +191,7 @@ class PatternsByPatch:
     others: ByPatch
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        """Return the vectors (cells, nodes, size) at places and normals (cells, nodes, 3)."""
         vectors = np.array(self.others(r0, n0))
         for is_inside, pattern in self.patterns:
             own_cells = is_inside[: len(r0)]  # owned cells come first
@@ -244,7 +256,7 @@ class CellPolynomials:
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
         for _ in range(MAX_NEWTON_STEPS):
-            # place and tangents at the present reference points
+            # places and tangents at the present reference points
             x, a1, a2 = (
                 derivative_table[..., 0] @ nodal for derivative_table in element.tabulate(1, X)
             )
@@ -346,17 +358,17 @@ def pattern_field(
     r0
         The placement.
     finer
-        How much higher the degree of the field is than that of r0; positive for loads.
+        How much higher the degree of the field is than that of r0; positive for loads alone.
     name, size
         Name of the field, and its number of components.
     key
-        Key of the case, for the message.
+        Key of the case, for the message. Messages on loads have `loading.loads` in its place.
 
     Returns
     -------
     field
         The field; its `rebuild` makes it on another placement.
-    size
+    integral
         Integral of the pattern's length over the surface. None if the pattern was interpolated:
         the field itself then has this integral.
 
@@ -367,14 +379,18 @@ def pattern_field(
     """
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
-    field = PlacementField(
-        Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
-    )
+
+    def rebuild(placement: fem.Function) -> fem.Function:
+        """Return the field on another placement."""
+        field_there, _ = pattern_field(pattern, placement, finer, name=name, key=key, size=size)
+        return field_there
+
+    field = PlacementField(Q, name, rebuild)
     # places and normals at the nodes of the field
     nodes, n0 = positions_and_normals(r0, Q.element.basix_element.points)
     # only loads have a finer field
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
-    at_nodes = pattern(inside_cells(nodes), n0)
+    at_nodes = pattern(inside_cells(nodes), n0)  # kept if the pattern is no formula
     projection = project_pattern(pattern, cell_geometry(r0), at_nodes, Q.element.basix_element)
     field.x.array.reshape(-1, size)[Q.dofmap.list] = projection.nodal
     # on a meridian (two components) integrals are per radian around the axis
@@ -383,7 +399,10 @@ def pattern_field(
 
 
 def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
-    """Return a formula as a discontinuous field (1,) on all cells; collective."""
+    """Return a formula of the place as a discontinuous field (1,) on all cells; collective.
+
+    `parameter` has the formula, a function of x, y and z over R, and its key in the case.
+    """
     field, _ = pattern_field(
         Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
     )
@@ -414,18 +433,25 @@ def pattern_on_edge(
     -------
     field
         The field; its `rebuild` makes it on another placement.
-    size
+    integral
         Integral of the pattern's length along the facets; None if the pattern was interpolated.
     """
     V = r0.function_space
-    # inside the cells an interpolant will do; only the nodes on facets are projected below
+    # first the pattern is interpolated on all cells; only the nodes on facets are projected below
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
-    field.rebuild = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
+
+    def rebuild(placement: fem.Function) -> fem.Function:
+        """Return the field on another placement."""
+        field_there, _ = pattern_on_edge(pattern, placement, facets, finer)
+        return field_there
+
+    field.rebuild = rebuild
     Q = field.function_space
     cells, local_sides = _cells_at_facets(V.mesh.topology, facets)
     edges = _facets_as_cells(r0, facets, cells, local_sides)
     element = Q.element.basix_element
-    edge_element = _interval_element(element.degree)
+    edge_element = _interval_element(element.degree)  # the field's element along a facet
+    # places, and normals (zero on an edge in space), at its nodes on each facet
     x, normals, _ = edges.evaluate(edge_element.points)
     projection = project_pattern(pattern, edges, pattern(inside_cells(x), normals), edge_element)
     if projection.smooth:
@@ -450,16 +476,18 @@ def _facets_as_cells(
 ) -> CellGeometry:
     """Return facets of the boundary as cells of dimension one, with their geometry.
 
-    `cells` and `local_sides` are those of `_cells_at_facets`.
+    `cells` are the cells at the facets, `local_sides` the local number of each facet in its cell.
     """
     V, topology = r0.function_space, r0.function_space.mesh.topology
     element = V.element.basix_element
     edge_element = _interval_element(element.degree)
-    # for each side of the reference triangle: shape functions of the cell at the edge's nodes
+    # for each side of the reference triangle: the nodes of an edge on it, and there the shape
+    # functions of the cell
     points_by_side = [
         _points_on_side(element.cell_type, side, edge_element.points) for side in range(3)
     ]
     tables_by_side = np.array([element.tabulate(0, X)[0, :, :, 0] for X in points_by_side])
+    # places (facets, nodes, 3) of the edges' nodes, from those of the cells' nodes
     cell_places = r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]
     nodal = np.matmul(tables_by_side[local_sides], cell_places).reshape(len(cells), -1, 3)
     owned = int(np.sum(facets < topology.index_map(1).size_local))
@@ -469,7 +497,10 @@ def _facets_as_cells(
 def _cells_at_facets(
     topology: mesh.Topology, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Return the one cell (facets,) at each boundary facet, and the facet's local number in it."""
+    """Return the one cell (facets,) at each boundary facet, and the facet's local number in it.
+
+    `facets` are their local numbers on this rank.
+    """
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
     to_cell, to_facet = topology.connectivity(1, 2), topology.connectivity(2, 1)
@@ -490,7 +521,9 @@ def _interval_element(degree: int) -> Element:
 
 def _points_on_side(cell_type: basix.CellType, side: int, points: Array) -> Array:
     """Map points (n, 1) of the unit interval to a side of the reference triangle: (n, 2)."""
-    a, b = basix.geometry(cell_type)[basix.topology(cell_type)[1][side]]
+    # the two corners at the ends of the side
+    _, corners_of_sides, *_ = basix.topology(cell_type)
+    a, b = basix.geometry(cell_type)[corners_of_sides[side]]
     return np.asarray(a + points * (b - a))
 
 
@@ -529,6 +562,13 @@ def project_pattern(
     A formula (with the flag `by_formula`) is projected by `project_formula`, so that its moments
     are right where it varies within a cell. Other patterns are interpolated: they keep `nodal`, the
     values (cells, nodes, components) at the nodes of `element`.
+
+    Parameters
+    ----------
+    cells
+        The cells with their geometry.
+    element
+        Element of the resulting values.
     """
     if not getattr(pattern, "by_formula", False):
         return ProjectedFormula(nodal, smooth=True, size=0.0)

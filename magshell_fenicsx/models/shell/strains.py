@@ -73,13 +73,17 @@ class TangentFrame:
     def membrane_strain(self, u: Array) -> Array:
         """Return E_11, E_12, E_22 (..., 3) in the frame, of a displacement.
 
-        The displacement's jet u is (6, ..., 3), over R. E is no difference of two metrics.
+        The displacement's jet u is (6, ..., 3), over R. E is computed from the derivatives of u and
+        not as a difference of two metrics, whose leading digits would cancel.
         """
         components = strain_components(self.jet[1:3], u[1:3], _dot)
         return _times(self.in_frame, np.stack(components, axis=-1))
 
     def curvature_change(self, u: Array) -> Array:
-        """Return R times K_11, K_12, K_22 (..., 3) in the frame, of a displacement's jet."""
+        """Return R times K_11, K_12, K_22 (..., 3) in the frame, of a displacement.
+
+        The displacement's jet u is (6, ..., 3), over R.
+        """
         n = self.normal(u)
         components = curvature_components(n, n - self.n0, self.jet[3:], u[3:], _dot)
         return _times(self.in_frame, np.stack(components, axis=-1))
@@ -99,17 +103,18 @@ class TangentFrame:
         if not np.any(thins):
             return convected
         m, area = _area_vector(self.jet[:3] + u[:3])
-        thinned = thins * (self.area / area - 1)
-        return np.asarray(convected + (thinned * _dot(self.n0, v) / area)[..., None] * m)
+        # s - 1: of a constant volume, the thickness grows as the area shrinks; m/area is n
+        stretch_less_one = thins * (self.area / area - 1)
+        return np.asarray(convected + (stretch_less_one * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
         """Return R v (..., 3) of vectors v, with the rotation R of the polar decomposition F = R U.
 
         `u` is the displacement's jet. A remanence that does not stretch moves in this way.
         """
-        f, n = self._deformed(u), self.normal(u)
-        # J F C^-1 on t_1 and t_2, with C = F^T F and J = sqrt(det C) in the surface;
-        # there R = (F + J F C^-1)/T, T² = tr C + 2 J
+        f, n = self._deformed(u), self.normal(u)  # f: F t_1 and F t_2, (..., 2, 3)
+        # the cofactor of F is J F C^-1, here applied to t_1 and t_2, with C = F^T F and
+        # J = sqrt(det C) in the surface. There R = (F + J F C^-1)/T with T² = tr C + 2 J
         cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
         T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
         return self._moved_with((f + cofactor) / T[..., None, None], v, u)
@@ -133,7 +138,9 @@ class TangentFrame:
 
 @dataclass(frozen=True)
 class NaturalFrame:
-    """Natural forms at points in their frames, at given amplitudes; see `kinematics.Forms`.
+    """Natural forms at points in their frames, at given amplitudes.
+
+    They are the metric a_n and the curvature b_n that the shell would have without stress.
 
     Attributes
     ----------
@@ -193,6 +200,7 @@ class NaturalFrame:
 
         E and K (..., 3) are strain and change of curvature in the frame, from the undeformed shape.
         """
+        # inverse metric U^-2 of the natural shape, and its area det U per undeformed area
         up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
         M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
         return np.asarray(area[..., None] * np.stack(M, axis=-1))
@@ -237,10 +245,12 @@ def _of_symmetric(A: Array) -> Array:
 
 
 def _times(A: Array, S: Array) -> Array:
+    """Return the products (..., n) of matrices A (..., n, m) and vectors S (..., m)."""
     return np.asarray(np.einsum("...ij,...j->...i", A, S))
 
 
 def _dot(a: Array, b: Array) -> Array:
+    """Return the scalar products (...) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 

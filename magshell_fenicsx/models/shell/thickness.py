@@ -40,6 +40,9 @@ MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR = 1e-3, 1e3
 class Thickness:
     """The factor h(x)/h, which multiplies the thickness.
 
+    It is given by one of `of_position` and `user_field`; without both it is 1. `patches` replace
+    it on some patches.
+
     Attributes
     ----------
     of_position
@@ -158,14 +161,16 @@ def thickness_field(
         On every rank, if the factor is too small or too large somewhere, or a patch is unknown.
     """
     V = r0.function_space
-    # values at the nodes without patches, checked before a formula is projected
+    # values at the nodes without patches, checked before a formula is projected; normals are not
+    # needed
     nodes, _ = positions_and_normals(r0)
     values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     if thickness.polynomials:  # they may leave the range of their nodal values
         between_nodes, sampled = thickness.polynomials.values_between_nodes()
         refuse_unfit(between_nodes[..., 0], sampled, V.mesh.comm)
-    values = thickness.values_in_cells(cell_geometry(r0), values)
+    values = thickness.values_in_cells(cell_geometry(r0), values)  # (cells, nodes)
+    # patches: one number, or the factor of the shell that the patch is
     for name, factor in (thickness.patches or {}).items():
         is_inside = patch_of(patches or {}, name, "shell.thickness_factor")
         if isinstance(factor, PlacedFactor):
@@ -228,7 +233,8 @@ def patch_of(
 def thickness_weighted(density: Density, t: fem.Function, component: int = 0) -> Density:
     """Return a density times a component of the field t, which becomes its last parameter.
 
-    By default it is the first component, the thickness over h.
+    The parameters of a density are fields and constants, the last arguments of its function. By
+    default the component is the first one, the thickness over h.
     """
 
     def weighted(*arguments: Expr) -> Expr:

@@ -9,7 +9,8 @@ edge's tangent, which has the surface on its left.
 - A growth G is the deformation of a part of the body without stress: only F G^(-1) is elastic. It
   has the energy of the grown volume, so times det G.
 - Br and Ba are the remanence and the applied flux density over their magnitudes.
-- Pi is an energy, p a pressure. X1, X2 and u1, u2 are derivatives by the coordinates of a face.
+- Pi is an energy, p a pressure, da an element of area. X1, X2 and u1, u2 are derivatives by the two
+  coordinates of a face, on which n is its normal.
 - `unit` is a factor that turns a volume over R³ into the unit of energies.
 """
 
@@ -72,7 +73,8 @@ def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
     """Magnetic density in the part Ba = G x of the field, at the deformed place x = X + u.
 
-    It is -(G x) . F Br/h without its value at u = 0, which is a constant.
+    G is the field's gradient, constant in space. The density is -(G x) . F Br/h without its value
+    at u = 0, which is a constant.
     """
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
@@ -81,16 +83,19 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
     """Magnetic density in a field known by values, without its value at u = 0.
 
-    P is the field's polynomial as in `field_at_displacement`.
+    P are the coefficients of the field's polynomial at the point. It gives the field B at the place
+    X + u, and the change of the field from X to X + u.
     """
     B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
-    """x . n da/3 under a face, per area of its coordinates, from its place and tangents x1, x2.
+    """x . n da/3 of a face, per area of its coordinates, from its place x and tangents x1, x2.
 
-    With flat ends through the origin the integral is the volume.
+    It is the volume of a cone from the origin to the element of the face. So the integral is the
+    volume between the face and the origin; it is all of a body whose other faces are flat and go
+    through the origin.
     """
     return ufl.dot(x, ufl.cross(x1, x2)) / 3
 
@@ -129,19 +134,28 @@ def follower_pressure_work(
 def sealing(
     X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None
 ) -> Expr:
-    """`pressure` on a part of an end, per undeformed area, with the tangents t and n."""
+    """Pi/p of a live pressure on a part of an end, times `unit`, per undeformed area.
+
+    It is `pressure` with the tangents t and n of the end, along which H has the derivatives of u.
+    """
     return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
 
 
 def swept_volume_on_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr) -> Expr:
-    """`swept_volume` on a part of an end, per undeformed area."""
+    """Volume that a part of an end sweeps, times `unit`, per undeformed area.
+
+    It is `swept_volume` with the tangents t and n of the end.
+    """
     return swept_volume(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit)
 
 
 def follower_pressure_work_on_end(
     X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, v: Expr, unit: Expr
 ) -> Expr:
-    """`follower_pressure_work` on a part of an end, per undeformed area."""
+    """Virtual work of p = 1 along v on a part of an end, times `unit`, per undeformed area.
+
+    It is `follower_pressure_work` with the tangents t and n of the end.
+    """
     return follower_pressure_work(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), v, unit)
 
 

@@ -4,11 +4,14 @@ Input: the displacement u and the amplitudes mu of a state. Output: a `surface.S
 gatherer of a meridian returns the surface of revolution that the meridian sweeps, in flat
 triangles.
 
-An amplitude is a load parameter, by name; mu maps names to values. An imperfection grows if an
-amplitude multiplies it. A jet is a map with its first and second derivatives at points. Samples are
-quadrature points inside cells; recovery fits smooth fields to strains and moments there. E and M
-are membrane strain and bending moment, with components 11, 12 and 22. w0 is the deviation of the
-drawn surface from the perfect one. h and R are thickness and reference length; lengths are over R.
+- An amplitude is a load parameter, by name; mu maps names to values. An imperfection grows if an
+  amplitude multiplies it.
+- A jet is a map with its first and second derivatives at points.
+- Samples are quadrature points inside cells; recovery fits smooth fields to strains and moments
+  there. The jump of samples is the rms of their difference from the smooth field, over their rms.
+- E and M are membrane strain and bending moment, with components 11, 12 and 22.
+- w0 is the deviation of the drawn surface from the perfect one. h and R are thickness and reference
+  length; lengths are over R.
 """
 
 from collections.abc import Mapping
@@ -63,7 +66,8 @@ class RevolvedGatherer:
         """Prepare the gathering for all states of a model of a meridian.
 
         `_inner` (q, 1) are the samples in the reference cell, and `rule` (q,) their weights.
-        `_swept` is the swept surface. `_recovered` takes samples to the ends of cells.
+        `_swept` is the swept surface. `_recovered` takes samples to the ends of cells. The other
+        fields are set by `_set_placement`.
         """
         self.comm, self._model = comm, model
         # Gauss points: as many as a second derivative of the displacement has coefficients
@@ -115,16 +119,17 @@ class RevolvedGatherer:
             # the chart is (s, 0): all around the axis the deviation is the same
             w0 = imperfect.w0(np.column_stack([s, 0 * s])) / model.material.h
             self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))
-        # a mask of cells for each shell: argmax finds the one that has the cell
+        # a mask of cells for each shell: argmax finds the number of the shell that has the cell
         if cells_in_shells := [*model.meridian.patches.values()]:
             shell_number = np.argmax(cells_in_shells, axis=0)[swept.order, None].astype(np.float64)
             self._fields.constant[SHELL] = np.asarray(np.repeat(shell_number, 2, axis=1))
         self._constant = self._swept_fields(self._fields.constant)
 
     def _cell_materials(self) -> Array | None:
-        """Return the four numbers (cells, 4) of each cell's material, see `Stresses`.
+        """Return the material (cells, 4) of each cell; None if all cells have one material.
 
-        None if all cells have one material.
+        The four numbers are modulus over that of the first shell, Poisson's ratio, density ratio
+        and number of the law of elasticity.
         """
         cell_materials = self._model.cell_materials
         if cell_materials is None:
@@ -135,6 +140,7 @@ class RevolvedGatherer:
     def _kinks(self) -> list[int]:
         """Return the numbers of the cells before which the normal or a prescribed field jumps."""
         model, fields = self._model, self._fields
+        # prescribed fields at both ends of cells: those that the case has
         prescribed_fields = [values for values in (fields.Br, fields.susceptibility) if values.size]
         if model.loads.natural:
             places = inside_cells(fields.jet[0])
@@ -142,6 +148,7 @@ class RevolvedGatherer:
         if model.thickness is not None:
             prescribed_fields.append(self._swept.scalars(model.thickness))
         sides = np.array([[0], [1]])  # a side of an interval is one of its ends
+        # the number of the smooth part of each cell, which changes between cells along the meridian
         part_numbers = smooth_parts(self._swept.ends, sides, prescribed_fields, fields.n0)
         return [int(i) + 1 for i in np.flatnonzero(np.diff(part_numbers))]
 
@@ -162,6 +169,7 @@ class RevolvedGatherer:
         swept = self._swept
         # strains and moments are recovered from samples, other fields are computed at ends
         stresses = self._stresses.values_of(swept.inner_jets(self._model.u, self._inner), state.mu)
+        # by name, "E" and "M": components at the ends, and the jump of the samples
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
         values = (
@@ -169,19 +177,22 @@ class RevolvedGatherer:
             | principal_fields(components)
             | self._fields.values_of(swept.jets(self._model.u), state.mu)
         )
+
+        def at_both_ends(of_cells: Array) -> Array:
+            """Return values (cells, 2) at the ends, from one value of each cell of the model."""
+            return np.repeat(of_cells[swept.order, None], 2, axis=1)
+
         if state.mu:  # of a mode there are no amplitudes, and no contact
-            add_contact(
-                values,
-                self._model,
-                state,
-                lambda of_cells: np.repeat(of_cells[swept.order, None], 2, axis=1),
-            )
+            add_contact(values, self._model, state, at_both_ends)
         values |= rubber_fields(values, self._law)
+        # at the nodes of the swept surface, with contact pressure only where the mesh resolves it
         fields = resolved_pressure(swept.cells, self._constant | self._swept_fields(values))
-        shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
         return Surface(
-            *shape,
-            fields,
+            r0=swept.r0,
+            u=swept.displacement(state.u),
+            n0=swept.n0,
+            cells=swept.cells,
+            fields=fields,
             jump=jumps["M"],
             strain_jump=jumps["E"],
             shells=self._model.meridian.shells,
@@ -212,6 +223,11 @@ class RecoveredMeridian:
         Model of the meridian.
     inner, rule
         (q, 1) samples in the reference cell, and their weights (q,).
+
+    The field `_recovery` fits a polynomial to the samples around each vertex. `_to_ends` and
+    `_to_samples` are matrices from the coefficients of all polynomials to values at cell ends and
+    at samples. `_pole_cells` are the numbers of the cells at poles, and `_weight` (cells, q) are
+    the lengths that samples stand for.
     """
 
     def __init__(
@@ -221,15 +237,13 @@ class RecoveredMeridian:
 
         Here s (cells, 2) is the parameter along the meridian at the ends of cells; `ends` (cells,
         2) are the numbers of vertices there, and `vertices` is the parameter of each vertex.
-        `_pole_cells` are the numbers of the cells at poles, `_to_ends` and `_to_samples` the
-        matrices, and `_weight` (cells, q) the lengths that samples stand for.
         """
         s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
         length, cells = np.diff(s), np.arange(len(s))
         samples = s[:, :1] + length * inner[:, 0]
         vertices = np.empty(ends.max() + 1)
         vertices[ends] = s
-        # cells of which one end (0 or 1) is at a pole
+        # the cells of which one end is at a pole, and the number of this end, 0 or 1
         pole_cells, pole_end = np.nonzero(np.isclose(s[..., None], poles).any(axis=2))
         self._pole_cells = pole_cells
         pole, other_end = s[pole_cells, pole_end], s[pole_cells, 1 - pole_end]
@@ -275,14 +289,14 @@ class RecoveredMeridian:
         at_ends
             Name -> (cells, 2, 3).
         jumps
-            Name -> `relative_jump` of the samples and the recovered field.
+            "E" and "M" -> rms of the samples' difference from the recovered field, over their rms.
         """
         at_ends, jumps = {}, {}
         for name, S in stresses.items():
             # the mirror image of a cell at a pole has the cell's own values: the field is even
             coefficients = self._recovery.coefficients(np.concatenate([S, S[self._pole_cells]]))
             at_ends[name] = (self._to_ends @ coefficients).reshape(-1, 2, 3)
-            if name in ROUNDING:
+            if name in ROUNDING:  # of E and M alone, up to a size that is zero
                 smooth_at_samples = (self._to_samples @ coefficients).reshape(S.shape)
                 jumps[name] = relative_jump(S, smooth_at_samples, self._weight, ROUNDING[name])
         return at_ends, jumps
@@ -314,10 +328,11 @@ class BodyGatherer:
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """Return the displaced body with its imperfections; collective.
 
-        On rank 0; None on other ranks. `mu` is there for the protocol `Gatherer` alone: a solid has
-        no field that depends on amplitudes.
+        On rank 0; None on other ranks. `mu` is not used here: a solid has no field that depends on
+        amplitudes.
         """
         system = self._model.system
+        # the first `size` numbers are the displacements of this rank's own nodes
         displacement = self._gather_nodes(system.with_ghosts(u)[: system.size].reshape(-1, 3))
         if self.comm.rank:
             return None

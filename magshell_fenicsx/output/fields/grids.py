@@ -1,8 +1,8 @@
 """Fields on grids outside the shell, as .vtu files for ParaView that pictures read back.
 
 A `MapGrid` has a corner, two sides (a plane) or three sides (a box), the numbers of points along
-them, and the flux density B at these points, the first side's points fastest. R is the reference
-length, over which places are.
+them, and the flux density B at these points. Points are numbered along the first side, then along
+the second and the third. R is the reference length; places are over R.
 """
 
 from math import isnan, nan
@@ -36,7 +36,7 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     # deep copies: VTK must not refer to memory that numpy frees
     points.SetData(numpy_to_vtk(np.ascontiguousarray(grid.places), deep=True))
     # VTK's cells: where each begins in one list of corners, and that list
-    corners = _cells(grid.points)
+    corners = _cells(grid.points)  # (cells, 4 or 8) numbers of points
     cell_starts = np.arange(0, corners.size + 1, corners.shape[1])
     cells.SetData(
         *(
@@ -77,7 +77,7 @@ def read_map(file: Path) -> tuple[MapGrid, float]:
 
     def map_grid(vtk_grid: "vtkUnstructuredGrid") -> tuple[MapGrid, float]:
         """Return the grid and R from VTK's grid."""
-        numbers = arrays(vtk_grid.GetFieldData())
+        numbers = arrays(vtk_grid.GetFieldData())  # name -> array, of the whole file
         texts = {name: _text(vtk_grid.GetFieldData(), name) for name in TEXT_FIELDS}
         points_per_side = tuple(int(n) for n in numbers["points_along"].ravel())
         values = arrays(vtk_grid.GetPointData())["B"].reshape(int(np.prod(points_per_side)), 3)
@@ -98,8 +98,9 @@ def _text(data: Any, name: str) -> str:
 def _cells(points: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the corners (cells, 4 or 8) of a grid's cells, in VTK's order.
 
-    `points` are the numbers of points along two or three sides. The corners of all cells are slices
-    of one array of point numbers: `low` leaves out its last point along a side, `high` its first.
+    `points` are the numbers of points along two or three sides. A cell has two corners along each
+    side. The lower corners of all cells are all points but the last one along the side (`low`), the
+    upper corners all points but the first one (`high`).
     """
     # the last axis of the array is the first side, whose points are numbered first
     number = np.arange(np.prod(points)).reshape(points[::-1])

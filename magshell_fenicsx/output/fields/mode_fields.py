@@ -41,7 +41,7 @@ COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
 class LabelledEigenvalue(Protocol):
-    """Label and eigenvalue of a mode, as of `shells.modes.ShellMode`."""
+    """Anything with the label and the eigenvalue of a mode, computed or read from a file."""
 
     @property
     def label(self) -> str: ...
@@ -85,7 +85,8 @@ def mode_surface(
         if gatherer.comm.rank:
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))
-        return _with_mode(*_revolved_wave(model, u, m, vector))
+        displaced_meridian, wave = _revolved_wave(model, u, m, vector)
+        return _with_mode(displaced_meridian, wave)
     # the mode is gathered like a displacement: it is the `u` of a second surface
     displaced, mode = gatherer.gather(u, mu), gatherer.gather(vector)
     if displaced is None or mode is None:  # on other ranks than 0
@@ -167,12 +168,13 @@ def mode_caption(number: int, mode: LabelledEigenvalue) -> str:
 def _with_mode(base: Surface, v: Array) -> Surface:
     """Return the surface with a mode v (n, 3) as its fields, scaled to a largest length of one.
 
-    The sign is such that the mode points inward at the first node where its normal component has
-    its largest magnitude.
+    The fields are "mode" and its inward normal component "mode_w". The sign is such that the mode
+    points inward at the first node where its normal component has its largest magnitude.
     """
     inward = -np.einsum("ij,ij->i", v, base.n0)
     magnitude = np.abs(inward)
-    # the crests and troughs of a wave differ only by rounding
+    # the crests and troughs of a wave have magnitudes that differ only by rounding: the first one
+    # is taken
     first_crest = np.argmax(magnitude > (1 - CREST_TOLERANCE) * magnitude.max())
     largest_length = np.linalg.norm(v, axis=1).max()
     scale = np.copysign(largest_length, inward[first_crest])
@@ -200,12 +202,12 @@ def _revolved_wave(
     swept = Revolution(model, sectors)
     # numbers of the circles of nodes in the function space of the waves
     vertices = swept.vertices(model.symmetry_breaking_modes.waves.V)
-    # each (circles, 1); the sum of the first two is stored, see the parameter
-    U_and_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
+    # each (circles, 1); the first one is the sum of U and V
+    U_plus_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     # torsion, m = 0, is V alone, the same at all angles
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
-    radial, azimuthal = (U_and_V - V) * cosine, V * sine
+    radial, azimuthal = (U_plus_V - V) * cosine, V * sine
     # (circles, sectors): from components along and around the axis to those along e1, e2 and e3
     x = radial * np.cos(theta) - azimuthal * np.sin(theta)
     y = radial * np.sin(theta) + azimuthal * np.cos(theta)
@@ -215,7 +217,7 @@ def _revolved_wave(
 
 
 def wave_number(surface: Surface) -> int | None:
-    """Return the number m >= 2 of a mode's waves around e3, see `ring.waves_around`.
+    """Return the number m >= 2 of a mode's waves around e3, counted on one ring of the surface.
 
     None if no single number fits, or the mesh does not resolve so many waves.
     """
@@ -269,7 +271,7 @@ class Frequency:
     point
         Number of the point on the path.
     wave
-        Circumferential wave number or symmetry of the mode, see `wave_of`.
+        Circumferential wave number, such as "7", or symmetry of the mode, such as "antisymmetric".
     omega2
         Square of the angular frequency, ω² ρ R²/E; negative for an unstable mode.
     hertz

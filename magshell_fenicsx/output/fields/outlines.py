@@ -46,7 +46,17 @@ def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ..
 
 
 def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]:
-    """Return the faces of bodies and sources, in the model's frame; arguments as of `outlines`."""
+    """Return the faces of bodies and sources over R, in the model's frame.
+
+    Parameters
+    ----------
+    loads
+        Bodies and magnetic fields.
+    mu
+        Amplitudes, which drive bodies and sources.
+    h
+        Thickness over R.
+    """
     solids_in_space = list[Solid]()
     for drawn_object, Q, t, name in _placed_objects(loads, mu, h):
         if solid := getattr(drawn_object, "solid", None):
@@ -59,8 +69,8 @@ def _placed_objects(
 ) -> Iterator[tuple[Any, Array, Array, str]]:
     """Yield (object, Q, t, name) of bodies and sources, with their rigid motion x -> Q x + t.
 
-    The motion begins at the place where all amplitudes are zero. Sources have no name. Arguments
-    are as of `outlines`.
+    The motion begins at the place where all amplitudes `mu` are zero. Sources have an empty name.
+    `h` is the thickness over R.
     """
     for contact in loads.contacts:  # the amplitude of a body is its approach, over h
         translation = mu.get(contact.amplitude, 0.0) * h * contact.direction
@@ -71,7 +81,8 @@ def _placed_objects(
     for part_of_field in getattr(loads.magnetic.in_space, "parts", ()):
         yield part_of_field, np.eye(3), np.zeros(3), ""
     for moving_source in loads.magnetic.driven:
-        yield moving_source.at_rest, *combined_motion(moving_source.motions, mu), ""
+        Q, t = combined_motion(moving_source.motions, mu)
+        yield moving_source.at_rest, Q, t, ""
 
 
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
@@ -91,7 +102,7 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     """
     # points: those of lines, then the corners of solids
     line_sizes = [len(line) for line in lines]
-    # number of each solid's first corner, after the points of lines
+    # number of each solid's first corner, after the points of lines; at last that of all points
     starts = np.cumsum([sum(line_sizes), *(len(solid.points) for solid in faces)])
     corners = [np.round(solid.points, DIGITS) for solid in faces]  # short numbers, small files
     triangles = [solid.triangles + start for solid, start in zip(faces, starts, strict=False)]
@@ -99,12 +110,13 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
         np.zeros(sum(line_sizes)),  # points of lines are no poles
         *(_poles_of(solid) for solid in faces),
     ]
-    # what tells the solids apart
+    # what tells the solids apart: numbers of corners and triangles, and names, which are texts as
+    # bytes with a zero after each
     counts = [[len(solid.points), len(solid.triangles)] for solid in faces]
-    numbers = np.array(counts).reshape(-1, 2)
+    sizes = np.array(counts).reshape(-1, 2)
     names = "".join(f"{solid.name}\0" for solid in faces).encode()
-    field_data = [  # texts are bytes with a zero after each name
-        _array("sizes", "Int64", numbers, f'NumberOfTuples="{len(faces)}"'),
+    field_data = [
+        _array("sizes", "Int64", sizes, f'NumberOfTuples="{len(faces)}"'),
         _array("names", "String", np.frombuffer(names, np.uint8), f'NumberOfTuples="{len(faces)}"'),
     ]
     # the XML of the arrays of all points and of all triangles
@@ -142,10 +154,14 @@ def _array(name: str, kind: str, values: NDArray[Any], attributes: str = "") -> 
 
     Parameters
     ----------
+    name
+        Name of the array in the file.
     kind
-        VTK's name of the type.
+        VTK's name of the type of its numbers, such as Int64.
+    values
+        (n,) or (n, components).
     attributes
-        Further attributes of the element.
+        Further attributes of the XML element.
     """
     width = values.shape[1] if values.ndim > 1 else 1
     text = " ".join(map(repr, values.ravel().tolist()))
@@ -197,7 +213,7 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     triangles = np.array(connectivity, dtype=int).reshape(-1, 3)
     poles, solids = np.array(arrays["pole"], dtype=float), list[Solid]()
     first_corner, first_triangle = on_lines, 0
-    # a zero ends the last name too, so there is an empty name more than solids
+    # a zero ends the last name too, so that an empty text is left after the names of all solids
     for name, (corner_count, triangle_count) in zip(names, solid_counts, strict=False):
         next_corner = first_corner + corner_count
         next_triangle = first_triangle + triangle_count

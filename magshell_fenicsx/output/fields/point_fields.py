@@ -3,14 +3,22 @@
 Input: jets of the placement and the displacement at points (cells, points per cell). Output: arrays
 by name, as `surface.Surface` has them. The theory is in docs/theory.md.
 
-A jet is a map with its first and second derivatives at points. h and R are thickness and reference
-length; lengths are over R. Br and Ba are remanence and applied flux density, mu the amplitudes
-(load parameters) of a state, lambda_m = |Br||Ba|/(mu_0 E). A field acts on a thin shell by a
-pressure p_mag, an in-plane force f_mag, rotational springs k and a torque tau. The remanence law is
-"deformation" (Br is convected) or "rotation" (Br turns and does not stretch). The arrays E and M
-are the components 11, 12, 22 of membrane strain and bending moment; in a unit such as h E lambda_m,
-E is Young's modulus, and D is the bending stiffness. A material thins if its thickness follows from
-its area, as that of rubber.
+- A jet is a map with its first and second derivatives by coordinates at points.
+- h and R are thickness and reference length; lengths are over R.
+- Br and Ba are remanence and applied flux density, mu the amplitudes (load parameters) of a state,
+  lambda_m = |Br||Ba|/(mu_0 E).
+- A field acts on a thin shell by a pressure p_mag, an in-plane force f_mag, rotational springs k
+  and a torque tau. B0 = -Br (x) Ba is their tensor.
+- The remanence law is "deformation" (Br is convected) or "rotation" (Br turns and does not
+  stretch).
+- The arrays E and M are the components 11, 12, 22 of membrane strain and bending moment; in a unit
+  such as h E lambda_m, E is Young's modulus, and D is the bending stiffness.
+- a0_a is the tangent basis of the undeformed surface, a0^a its dual basis, n0 its normal, b0 its
+  curvature.
+- The natural shape is the one that the shell would have without stress; its growth is given by two
+  amplitudes, `CURVATURE` and `STRETCH`.
+- A material thins if its thickness follows from its area, as that of rubber. Soft material has a
+  polarisation that the field induces; it may have a remanence too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,7 +68,8 @@ def magnetic_loads(
     loads
         Name -> (...) p_mag and k, and (..., 3) f_mag.
     torque
-        Function of the displacement's derivatives, see `Torque`.
+        Function of the displacement's derivatives u,_1 and u,_2, (..., 2, 3), which returns the
+        torque (..., 3).
     """
     pattern = field.remanent  # a vector, or a function of places and normals
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
@@ -69,13 +78,16 @@ def magnetic_loads(
     rotates = field.law == "rotation"
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if rotates:
-        # to first order a rotation takes the antisymmetric part of B0 alone: b0:B0 is zero
+        # to first order only the antisymmetric part of B0 does work: its product with the symmetric
+        # b0 is zero
         loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
     if not callable(pattern) and isinstance(h, float):
         # the formula of f_mag assumes uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
         if rotates:
-            loads["f_mag"] = (loads["f_mag"] - in_plane_force(g, Ba, pattern, h)) / 2
+            # the antisymmetric part: the transpose of B0 has Br and Ba exchanged
+            of_transpose = in_plane_force(g, Br=Ba, Ba=pattern, h=h)
+            loads["f_mag"] = (loads["f_mag"] - of_transpose) / 2
     return loads, torque(g, Br, Ba, rotates=rotates)
 
 
@@ -116,8 +128,8 @@ def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array
 def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
     """Return the in-plane force f_mag (..., 3) of uniform Br and Ba, as a vector.
 
-    f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this
-    equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
+    Its covariant component f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For
+    constant vectors this equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
     tangential_Br = np.einsum("...ai,...i->...a", dual, Br)  # a^a . Br
@@ -144,11 +156,12 @@ class Torque:
     n0
         (..., 3) normals.
     coefficients
-        (..., 2): -(n0 . Br)(a0^a . Ba). For a remanence that does not stretch, that and half of
-        (n0 . Ba)(a0^a . Br).
+        (..., 2) the factors of u,_a: -(n0 . Br)(a0^a . Ba). For a remanence that does not stretch,
+        half of (n0 . Ba)(a0^a . Br) is added.
     dual, transposed
-        Dual basis (..., 2, 3), and half of (n0 . Ba) times the tangential part of Br, (..., 3).
-        None for a convected remanence, which has no such term.
+        Only for a remanence that does not stretch, which has one more term, of the transposed B0:
+        the dual basis (..., 2, 3), and half of (n0 . Ba) times the tangential part of Br, (..., 3).
+        Else None.
     """
 
     n0: Array
@@ -161,9 +174,9 @@ class Torque:
 
         `du` are the derivatives u,_1 and u,_2 (..., 2, 3).
         """
-        # the coefficients times du, without its part along n0
-        rotation = np.matmul(self.coefficients[..., None, :], du)[..., 0, :]
-        torque = rotation - np.sum(rotation * self.n0, axis=-1, keepdims=True) * self.n0
+        # the sum of coefficients times u,_a, of which the part along n0 is left out
+        weighted_du = np.matmul(self.coefficients[..., None, :], du)[..., 0, :]
+        torque = weighted_du - np.sum(weighted_du * self.n0, axis=-1, keepdims=True) * self.n0
         if self.dual is not None and self.transposed is not None:
             torque = torque + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
         return np.asarray(torque)
@@ -178,7 +191,7 @@ def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -
     coefficients = -normal_Br * np.einsum("...ai,i->...a", g.dual, Ba)
     if not rotates:
         return Torque(g.n0, coefficients)
-    # further terms of a remanence that does not stretch, see `Torque`
+    # a remanence that does not stretch has further terms
     in_surface = Br - normal_Br * g.n0
     half_normal_Ba = (g.n0 @ Ba / 2)[..., None]
     coefficients = coefficients + half_normal_Ba * np.einsum("...ai,...i->...a", g.dual, Br)
@@ -191,8 +204,7 @@ class Stresses:
     Parameters
     ----------
     r0
-        (6, cells, points, 3) jet of the placement: r0 and its derivatives, see
-        `strains.TangentFrame`.
+        (6, cells, points, 3) jet of the placement: r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22.
     material
         Material of the shell.
     thickness
@@ -200,13 +212,17 @@ class Stresses:
     natural
         The natural shape; None if the drawn shape is without stress.
     made_of
-        (cells, 4) `parameters.ShellMaterial.numbers` of each cell: modulus over that of the first
-        shell, Poisson's ratio, density ratio, number of the law. None if all have `material`.
+        (cells, 4) numbers of each cell's material: modulus over that of the first shell, Poisson's
+        ratio, density ratio, number of the law. None if all cells have `material`.
 
     Attributes
     ----------
     frame
         Tangent bases and normals of the undeformed surface at the points.
+
+    The field `_law` is the law of elasticity for the thickness h, `_thickness` the factor of h.
+    `_natural` are the tensors of the natural shape, None without one. `_unit` is the unit of
+    moments.
     """
 
     def __init__(
@@ -217,11 +233,7 @@ class Stresses:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
-        """Set frames, law and natural shape at the points.
-
-        `_law` is the law of elasticity for the thickness h, `_natural` the tensors of the natural
-        shape, None without one, and `_unit` the unit of moments.
-        """
+        """Set frames, law and natural shape at the points."""
         self.frame = frame = TangentFrame.from_jet(r0)
         self._thickness = thickness
         self._law = material.law_in(made_of).at_point(
@@ -255,7 +267,7 @@ class Stresses:
             return {"E": E, "M": np.asarray(bending_moment(E, K, law) / self._unit)}
         # stresses come from the strain beyond the natural shape, which grows with two amplitudes
         shape = NaturalFrame.from_tensors(
-            frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
+            frame, *self._natural, bent=mu.get(CURVATURE, 0.0), stretched=mu.get(STRETCH, 0.0)
         )
         elastic_strain, M = shape.elastic(E), shape.moment(E, K, law)
         return {"E": elastic_strain, "M": np.asarray(M / self._unit), "E_total": E}
@@ -331,8 +343,7 @@ class PointFields:
     Parameters
     ----------
     r0
-        (6, cells, points, 3) jet of the placement: r0 and its derivatives, see
-        `strains.TangentFrame`.
+        (6, cells, points, 3) jet of the placement: r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22.
     material
         Material of the shell.
     field
@@ -346,8 +357,8 @@ class PointFields:
     natural
         The natural shape. A material that thins has its thickness from the volume of this shape.
     made_of
-        (cells, 4) `parameters.ShellMaterial.numbers` of each cell; None if all cells have
-        `material`.
+        (cells, 4) numbers of each cell's material: modulus over that of the first shell, Poisson's
+        ratio, density ratio, number of the law. None if all cells have `material`.
 
     Attributes
     ----------
@@ -363,6 +374,12 @@ class PointFields:
         without one.
     susceptibility
         (cells, points, 1) magnetic susceptibility; (cells, points, 0) without soft material.
+
+    The field `_field` has the applied field. `_magnetisation` has the remanence, with or without an
+    applied field; it is None if the material is soft alone. `_frame` are the tangent frames at the
+    points. `_thins` (1 or 0) tells where the material thins. `_natural` are the tensors of the
+    natural shape, None where no gap depends on them. `_torque` is a function of the displacement's
+    derivatives, None without a uniform field.
     """
 
     def __init__(
@@ -379,10 +396,6 @@ class PointFields:
         """Set the constant fields, and what fields of a displacement need.
 
         Formulas are evaluated slightly inside cells, so that one that jumps has both its values.
-        `_field` has the applied field. `_magnetisation` has the remanence, with or without an
-        applied field; it is None if the material is soft alone. `_thins` tells where the material
-        thins. `_natural` are the tensors of the natural shape, None where no gap depends on them.
-        `_torque` is None without a uniform field.
         """
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
@@ -472,16 +485,20 @@ class PointFields:
         return fields
 
     def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
-        """Return the deformed thickness over the undeformed one (cells, points); see `parts.gap`.
+        """Return the deformed thickness over the undeformed one (cells, points).
 
-        It is 1 where the thickness is constant. `u` and `mu` are as in `values_of`.
+        It is 1 where the thickness is constant. `u` (3 or 6, cells, points, 3) is the jet of the
+        displacement, `mu` has the amplitudes of the state.
         """
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         # of constant volume: the thickness grows as the area shrinks
         stretch = self._frame.area / area
         if self._natural is not None:
             shape = NaturalFrame.from_tensors(
-                self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
+                self._frame,
+                *self._natural,
+                bent=mu.get(CURVATURE, 0.0),
+                stretched=mu.get(STRETCH, 0.0),
             )
             # the volume is that of the natural shape, whose area and thickness are other ones
             stretch = stretch * shape.thickness / np.linalg.det(shape.inverse)
@@ -490,17 +507,19 @@ class PointFields:
     def _gap(self, u: Array, mu: Mapping[str, float]) -> Array:
         """Return the least gap to a body over h (cells, points); negative where they overlap.
 
-        `u` and `mu` are as in `values_of`.
+        `u` (3 or 6, cells, points, 3) is the jet of the displacement, `mu` has the amplitudes of
+        the state.
         """
         h, r = self._h, self._frame.jet[0] + u[0]
         thickness = 1.0 if self._thickness is None else self._thickness
         thickness = thickness * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
         thickness = np.broadcast_to(thickness, r.shape[:-1]).ravel()
-        # the first of gap, gradient and Hessian; the amplitude is the body's approach over h
-        gaps = [
-            contact.gap(r.reshape(-1, 3), h * mu.get(contact.amplitude, 0.0), h / 2 * thickness)[0]
-            for contact in self._contacts
-        ]
+        gaps, places = list[Array](), r.reshape(-1, 3)
+        for contact in self._contacts:
+            # the amplitude is the body's approach over h; gradient and Hessian are not needed
+            approach = h * mu.get(contact.amplitude, 0.0)
+            gap, *_ = contact.gap(places, approach, half=h / 2 * thickness)
+            gaps.append(gap)
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:

@@ -6,8 +6,13 @@ which prescribed fields and the normal are continuous. Each part is recovered on
 
 Samples are quadrature points inside cells. A vertex is at an edge if a cell's side there has no
 neighbour; the first ring of cells around it are its own cells, the second ring those that share a
-vertex with them. Shapes: m cells, q samples in each, v vertices, d coordinates on a surface (1 on a
-meridian, 2 on a shell), k coordinates of a place. E and M are membrane strain and bending moment.
+vertex with them. The patch of a vertex has the cells whose samples its polynomial is fitted to.
+
+Shapes: m cells, q samples in each, v vertices, n nodes, d coordinates on a surface (1 on a
+meridian, 2 on a shell), k coordinates of a place. A frame has unit vectors as rows, d of them in
+the tangent plane. E and M are membrane strain and bending moment. Tensors in space are symmetric
+matrices (3, 3), or their six different components, each times the root of how often it stands in
+the matrix: so the sum of the six squares is that of all nine (`COMPONENT_WEIGHTS`).
 """
 
 from collections.abc import Mapping
@@ -45,6 +50,7 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
     """
 
     def mean_square(f: Array) -> float:
+        """Return the weighted mean of f squared; further axes are components, which are summed."""
         squared = (f**2).reshape(*weight.shape, -1).sum(axis=-1)
         return float((weight * squared).sum() / weight.sum())
 
@@ -78,6 +84,10 @@ class Recovery:
         (v, d, k) axes of the polynomial's d coordinates around each vertex.
     degree
         Degree of the polynomials.
+
+    `_patch_size` (v,) has the extent of each vertex's patch, by which coordinates are divided.
+    `_coefficient_count` is the number of coefficients of a polynomial. `_coefficients` is the
+    sparse matrix from samples to the coefficients of all polynomials, vertex after vertex.
     """
 
     def __init__(
@@ -91,16 +101,15 @@ class Recovery:
     ) -> None:
         """Set the sparse matrix from samples to the coefficients of all polynomials.
 
-        A row of the matrix `_coefficients` belongs to one coefficient of one vertex; its columns
-        are the samples around that vertex. The matrix is filled directly in the form of
-        `scipy.sparse.csr_matrix`: `values` and `columns` of all entries, row after row, and
-        `starts` of the rows in both.
+        A row of the matrix belongs to one coefficient of one vertex; its columns are the samples
+        around that vertex. The matrix is filled directly in the form of `scipy.sparse.csr_matrix`:
+        `values` and `columns` of all entries, row after row, and `starts`, where each row begins.
         """
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
         self._coefficient_count = count = len(_powers(cells.shape[1] - 1, degree))
-        # extent of each vertex's patch, by which its coordinates are divided; set by the fits
-        self._patch_size = np.ones(len(vertices))
+        self._patch_size = np.ones(len(vertices))  # set by the fits below
         samples_per_cell = weight.shape[1]
+        # the cells around each vertex as a sparse pattern (v, m), and the weight of each entry
         patches, cell_weights = _patches(cells, len(vertices))
         cells_per_vertex = np.diff(patches.indptr)
         # a row for each coefficient of each vertex
@@ -113,9 +122,10 @@ class Recovery:
             patch_entries = patches.indptr[vertices_alike][:, None] + np.arange(cell_count)
             cells_around = patches.indices[patch_entries]  # (vertices, cells of each)
             sample_weights = weight[cells_around] * cell_weights[patch_entries][..., None]
+            # (vertices, coefficients, samples): from values to coefficients
             fit_matrices = self._fit_matrices(vertices_alike, samples[cells_around], sample_weights)
             fits = fit_matrices.reshape(len(vertices_alike), -1)
-            # (vertices, samples of each)
+            # (vertices, samples): the numbers of the samples around each vertex
             sample_numbers = _members(cells_around, samples_per_cell)
             sample_numbers = sample_numbers.reshape(len(vertices_alike), -1)
             # the rows of a vertex follow one another in `values` and `columns`
@@ -165,8 +175,8 @@ class Recovery:
         scaled_coordinates = local_coordinates / self._patch_size[vertices_of_cells][..., None]
         # monomials at the place, times the blend weight of the vertex
         values = _monomials(scaled_coordinates, self._degree) * barycentric[..., None]
-        columns = _members(vertices_of_cells, self._coefficient_count)
-        starts = np.arange(len(cell) + 1) * columns[0].size
+        columns = _members(vertices_of_cells, self._coefficient_count)  # numbers of coefficients
+        starts = np.arange(len(cell) + 1) * columns[0].size  # where each row begins
         return scipy.sparse.csr_matrix(
             (values.ravel(), columns.ravel(), starts),
             (len(cell), len(self._vertices) * self._coefficient_count),
@@ -203,10 +213,10 @@ class Recovery:
         ridge = np.broadcast_to(
             RIDGE * np.eye(coefficient_count), (n, coefficient_count, coefficient_count)
         )
-        # rows of the ridge, with values of zero, keep every fit regular; a factorisation by
-        # reflections keeps the condition small, where normal equations would square it
+        # below the samples the ridge has rows of its own, whose values are zero. A QR factorisation
+        # keeps the condition small, where normal equations would square it
         Q, upper_triangle = np.linalg.qr(np.concatenate([weight_roots * monomials, ridge], axis=1))
-        Q_of_samples = Q[:, :sample_count]  # the ridge's rows have values of zero
+        Q_of_samples = Q[:, :sample_count]  # the ridge's rows, with values of zero, are left out
         fits = np.linalg.solve(upper_triangle, np.swapaxes(Q_of_samples * weight_roots, 1, 2))
         return np.asarray(fits)
 
@@ -214,13 +224,17 @@ class Recovery:
 def _members(groups: Numbers, group_size: int) -> Numbers:
     """Return the numbers (..., group_size) of the members of groups, numbered group after group.
 
-    Group 2 of three members has the members 6, 7 and 8.
+    A group is a cell with its samples, or a vertex with its coefficients. Of three members each,
+    group 2 has the members 6, 7 and 8.
     """
     return np.asarray(groups[..., None] * group_size + np.arange(group_size))
 
 
 def _affordable_degree(degree: int, dimensions: int, sample_count: int) -> int:
-    """Return the degree, lowered until the samples are more than the coefficients."""
+    """Return the degree, lowered until there are more samples than coefficients.
+
+    `dimensions` is the number of the polynomial's variables.
+    """
     while degree and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(dimensions, degree)) > sample_count:
         degree -= 1
     return degree
@@ -270,11 +284,11 @@ def _powers(dimensions: int, degree: int) -> list[tuple[int, ...]]:
 
 def _monomials(y: Array, degree: int) -> Array:
     """Return the values (..., coefficients) of all monomials up to `degree` at y (..., d)."""
-    exponents = range(degree + 1)
-    powers = [np.stack([x**n for n in exponents], axis=-1) for x in np.moveaxis(y, -1, 0)]
+    # of each variable its powers (..., degree + 1)
+    powers = [np.stack([x**n for n in range(degree + 1)], axis=-1) for x in np.moveaxis(y, -1, 0)]
     monomials = []
-    for numbers in _powers(len(powers), degree):
-        factors = [power[..., n] for power, n in zip(powers, numbers, strict=True)]
+    for exponents in _powers(len(powers), degree):
+        factors = [power[..., n] for power, n in zip(powers, exponents, strict=True)]
         monomials.append(np.prod(factors, axis=0))
     return np.stack(monomials, axis=-1)
 
@@ -301,6 +315,9 @@ class RecoveredShell:
         (q, s) values of the nodes' shape functions at the samples.
     degree
         Degree of the displacement, and of the polynomials that are fitted.
+
+    The field `_recovery` fits polynomials around vertices, and `_to_nodes` is the matrix from their
+    coefficients to values at the nodes (n,). `_numbers`, `_weight` and `_table` are the parameters.
     """
 
     def __init__(
@@ -317,11 +334,9 @@ class RecoveredShell:
         """Set the recovery around the vertices, and its evaluation at all nodes.
 
         Vertices are the corners of cells, renumbered; the normal at a vertex is the sum of the
-        cells' normals there. `_recovery` fits polynomials around vertices, and `_to_nodes` is the
-        matrix from their coefficients to values at the nodes (n,). `_numbers`, `_weight` and
-        `_table` are the parameters.
+        cells' normals there.
         """
-        # corners are the first three nodes of a cell; here by the numbers of vertices
+        # the first three nodes of a cell are its corners: (m, 3) numbers of vertices
         vertices, corners = np.unique(numbers[:, :3], return_inverse=True)
         corners = corners.reshape(-1, 3)
         vertex_places, vertex_normals = np.zeros((2, len(vertices), 3))
@@ -330,7 +345,8 @@ class RecoveredShell:
         self._recovery = Recovery(
             corners, samples, weight, vertex_places, frames_across(vertex_normals), degree
         )
-        # each node is evaluated once: as node number `node_in_cell` of the first cell that has it
+        # each node is evaluated once, in the first cell that has it; `node_in_cell` is its number
+        # in that cell
         _, first_entry = np.unique(numbers, return_index=True)
         cell, node_in_cell = np.divmod(first_entry, numbers.shape[1])
         barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node_in_cell]
@@ -349,7 +365,8 @@ class RecoveredShell:
         Parameters
         ----------
         tensors
-            Name -> (m, q, 6) weighted components at the samples, see `components_in_space`.
+            Name, such as "E" and "M" -> (m, q, 6) components in space at the samples, times
+            `COMPONENT_WEIGHTS`.
         n0
             (n, 3) normals at the nodes.
 
@@ -358,7 +375,7 @@ class RecoveredShell:
         fields
             Name -> (n, 3, 3) E, M, ..., and (n,) E_1, E_2, ....
         jumps
-            Name -> `relative_jump` of the samples and the recovered field.
+            "E" and "M" -> rms of the samples' difference from the recovered field, over their rms.
         """
         # all tensors are fitted together, side by side, and then split again
         coefficients = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
@@ -368,7 +385,8 @@ class RecoveredShell:
         for name, zero in ROUNDING.items():
             smooth_at_samples = self._table @ at_nodes[name][self._numbers]
             jumps[name] = relative_jump(tensors[name], smooth_at_samples, self._weight, zero)
-        # from weighted components to tensors (n, 3, 3), and to components in tangent frames
+        # from weighted components to tensors (n, 3, 3), then to components 11, 12, 22 in tangent
+        # frames t, which projects them
         t = frames_across(n0)
         components = {
             name: in_frame((values / COMPONENT_WEIGHTS)[..., COMPONENT_NUMBERS], t)
@@ -421,12 +439,12 @@ def smooth_parts(
     prescribed_fields
         Fields (m, s, ...) at the nodes.
     normals
-        (m, s, 3)
+        (m, s, 3) unit normals at the nodes.
     """
     count = len(corners)
     # a side of two cells is listed twice, once with each cell
     nodes_of_sides = corners[:, sides].reshape(-1, sides.shape[1])  # cell after cell
-    # sorted node numbers identify a side from both of its cells
+    # sorted node numbers identify a side from both of its cells: pairs of rows of one side
     order = np.argsort(nodes_of_sides, axis=1)
     shared_sides = _equal_rows(np.take_along_axis(nodes_of_sides, order, axis=1))
 
@@ -442,7 +460,8 @@ def smooth_parts(
     is_split = kink > KINK
     for field in prescribed_fields:
         largest = np.abs(field).max() or 1.0
-        # a field along the normal turns with facets
+        # on a surface of flat cells the normal jumps a little, and with it a field along the
+        # normal: such a jump does not count
         is_split |= jumps(field) > largest * (FIELD_JUMP + 2 * kink)
     # sides are listed cell after cell, so division gives the cells on both sides
     first_cells, second_cells = (shared_sides[~is_split] // len(sides)).T
@@ -454,14 +473,14 @@ def smooth_parts(
 
 
 def _equal_rows(rows: Numbers) -> Numbers:
-    """Return the pairs (e, 2) of row numbers whose rows are equal; each row equals at most one.
+    """Return the pairs (e, 2) of row numbers whose rows are equal.
 
-    Rows that occur once, or more than twice, are in no pair.
+    Only rows that occur exactly twice are in a pair.
     """
     _, first_with_key, key_numbers, rows_with_key = np.unique(
         rows, axis=0, return_index=True, return_inverse=True, return_counts=True
     )
-    key_numbers = key_numbers.ravel()  # of each row
+    key_numbers = key_numbers.ravel()  # of each row the number of its content
     occurs_twice = rows_with_key[key_numbers] == 2
     is_later = first_with_key[key_numbers] != np.arange(len(rows))
     second_rows = np.flatnonzero(occurs_twice & is_later)

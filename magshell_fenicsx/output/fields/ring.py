@@ -73,7 +73,9 @@ class Ring:
         # weights by the length of arc: small elements have many points
         arc_weights = np.sqrt((angle_to_next + np.roll(angle_to_next, 1)) / 2)
         values = arc_weights * self.w
-        remainders = []  # for each m the part of the mode that cos(m theta), sin(m theta) leave
+        # for each m the square of what is left of the mode after the fit of waves cos(m theta) and
+        # sin(m theta)
+        remainders = []
         for m in range(MAX_WAVES + 1):
             wave = np.column_stack([np.cos(m * self.theta), np.sin(m * self.theta)])
             basis = arc_weights[:, None] * wave
@@ -115,12 +117,17 @@ def waves_around(surface: Surface) -> WaveCount | None:
 
 
 def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: float) -> Ring | None:
-    """Return the ring at a height z over R that passes a place; None if it is not closed around e3.
+    """Return the ring at a height z over R; None if it is not closed around e3.
 
     Parameters
     ----------
+    surface
+        The surface with the field "mode_w".
+    tessellation
+        Its flat triangles.
     crest
-        (3,) place of the largest mode; of several rings at that height it chooses the nearest.
+        (3,) place where the mode is largest. Of several rings at that height the nearest to this
+        place is taken.
     """
     r, mode_w = tessellation.at_points(surface.r0), tessellation.at_points(surface.fields["mode_w"])
     is_above = r[tessellation.triangles, 2] > height
@@ -129,9 +136,9 @@ def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: fl
         return None
     triangles = tessellation.triangles[cut_triangles]
     values = np.column_stack([r, mode_w])
-    # each cut triangle has one line of a ring, with two ends; `on_ring` are lines of one ring
+    # each cut triangle has one line of a ring: (t, 2, 2) x and y of its ends, and (t, 2) w there
     ends, w_at_ends = _cuts(triangles, is_above[cut_triangles], values, height)
-    on_ring = _connected(ends, crest)
+    on_ring = _connected(ends, crest)  # numbers of the lines of the ring that is nearest
     theta = np.arctan2(ends[on_ring, :, 1], ends[on_ring, :, 0])
     order = np.argsort(theta, axis=None)
     ascending = theta.ravel()[order]
@@ -176,7 +183,7 @@ def _cuts(
     single, other_two = corners[:, :1], corners[:, 1:]
     # the plane cuts the two sides from the single corner to the others
     fraction = (height - single[..., 2]) / (other_two[..., 2] - single[..., 2])
-    ends = single + fraction[..., None] * (other_two - single)
+    ends = single + fraction[..., None] * (other_two - single)  # (t, 2, 4): x, y, z and w
     return ends[..., :2], ends[..., 3]
 
 
@@ -204,9 +211,10 @@ def _extent(nodes: Array, theta: Array) -> float:
     Parameters
     ----------
     nodes
-        (t, k, 3) nodes of the cells.
+        (t, k, 3) places of the nodes of the cells.
     theta
-        (t,) azimuth of a point in each cell, so that angles do not jump by 2 pi.
+        (t,) azimuth of a point in each cell. Angles of nodes are counted from it, so that they do
+        not jump by 2 pi.
     """
     azimuth = np.arctan2(nodes[..., 1], nodes[..., 0]) - theta[:, None]
     return float(np.ptp((azimuth + np.pi) % (2 * np.pi) - np.pi, axis=1).max())

@@ -3,11 +3,17 @@
 A `Surface` has the nodes of the whole shell or body, and fields at the nodes. A `SurfaceGatherer`
 makes it from a state of a shell model. Half shells and sectors are completed by symmetry.
 
-A state has the displacement u and the amplitudes mu: load parameters, by name. An imperfection
-grows if an amplitude multiplies it; its deviation w0 is the distance of the drawn surface from the
-perfect one. Samples are quadrature points in cells, to which smooth strains E and moments M are
-fitted: they are recovered. A smooth part of the surface ends where the normal or a prescribed field
-jumps. h and R are thickness and reference length; lengths are over R.
+- A state has the displacement u and the amplitudes mu: load parameters, by name.
+- An imperfection grows if an amplitude multiplies it; its deviation w0 is the distance of the drawn
+  surface from the perfect one.
+- Samples are quadrature points in cells, to which smooth strains E and moments M are fitted: they
+  are recovered.
+- A smooth part of the surface ends where the normal or a prescribed field jumps.
+- A jet is a map with its first and second derivatives by the reference coordinates, at points.
+- Each rank owns some cells; fields at nodes are (cells, nodes of a cell, ...) before they are
+  gathered, and (nodes, ...) on rank 0 after that. In the arrays of a rank owned cells come first,
+  then ghosts.
+- h and R are thickness and reference length; lengths are over R.
 """
 
 from collections.abc import Callable, Mapping
@@ -48,7 +54,8 @@ LARGE_MESH = 20_000  # cells, whose recovery would take a quarter of a gigabyte 
 GAP = "gap_over_h"  # to the faces of bodies, and of other parts of the shell: the least in a cell
 # of bodies and of parts of the shell, over E h/R; nan where cells are too wide
 PRESSURE = "contact_pressure"
-# see `add_contact`
+# auxiliary fields: whether a cell is pressed all over, the pressure of such cells, and whether
+# there is a gap to a body
 RESOLVED, RESOLVED_PRESSURE, GAP_OPEN = "evenly_pressed", "pressure_of_even", "open"
 LARGEST_CLOSED_GAP = 1e-2  # over h
 SHELL = "shell"  # the number of the shell, where there are several
@@ -82,7 +89,8 @@ class Surface:
     outlines
         Places (n, 3) along lines that outline the sources of the applied field, and bodies.
     jump
-        Jump of the bending moments M between cells, see `recovery.relative_jump`. None for a solid.
+        Jump of the bending moments M between cells: the rms of the samples' difference from the
+        recovered field, over their rms. None for a solid.
     strain_jump
         The same measure for the strains E.
     solids
@@ -126,14 +134,16 @@ class SurfaceGatherer:
         """Prepare the gathering for all states of a model; collective.
 
         `_element` has the equidistant nodes at which fields are given, at `_reference_nodes` in the
-        reference triangle. `_reference_samples` are the places of samples there. Rank 0 has
-        `_recovered`, which fits fields to samples; on other ranks it stays None.
+        reference triangle. `_reference_samples` are the places of samples there, with
+        `_sample_weights`. `_owned_cells` is the number of this rank's cells. Rank 0 has
+        `_recovered`, which fits fields to samples; on other ranks it stays None. The other fields
+        are set by `_set_placement` and `_split_nodes`.
         """
         self._model = model
         domain, degree = model.V.mesh, model.degree
         self.comm = domain.comm
-        # VTK's nodes are equidistant, the displacement's are not; their numbers on edges and in
-        # cells are equal
+        # VTK's nodes are equidistant, the displacement's are not; each edge and each cell has
+        # equally many nodes of both kinds
         self._element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
@@ -146,12 +156,13 @@ class SurfaceGatherer:
             basix.CellType.triangle, max(sample_degree, degree)
         )
         self._owned_cells = cells.size_local
-        # this space of functions numbers each shared node once: (cells, nodes of a cell)
+        # a space of functions numbers each node once that cells share: (cells, nodes of a cell)
         V = fem.functionspace(domain, basix.ufl.wrap_element(self._element))
         local_nodes = V.dofmap.list[: self._owned_cells]
         numbers = V.dofmap.index_map.local_to_global(local_nodes.ravel().astype(np.int32))
         numbers = numbers.reshape(local_nodes.shape)
         self._recovered: RecoveredShell | None = None
+        # without displacement and amplitudes: no imperfection has grown
         undeformed = model.system.at_state(State(model.zero(), {}))
         undeformed.evaluate(lambda: self._set_placement({}, self._gather_cells(numbers)))
 
@@ -162,8 +173,9 @@ class SurfaceGatherer:
 
         `_fields` computes fields of a displacement at nodes, `_stresses` strains and moments at
         samples. `_to_space` maps components in tangent frames to components in space. `_constant`
-        has the fields that no displacement changes. `_averaging_matrix` is that of
-        `_weighted_mean`; `_r0` and `_n0` are placement and unit normals at the nodes.
+        has the fields that no displacement changes. `_averaging_matrix` takes values at the nodes
+        of all cells to means at the nodes of the surface. `_r0` and `_n0` are placement and unit
+        normals at the nodes.
 
         Parameters
         ----------
@@ -227,7 +239,7 @@ class SurfaceGatherer:
         r, r_at_samples
             Placement (cells, points, 3) of this rank's cells, at the nodes and at the samples.
         """
-        # what rank 0 needs from the cells of all ranks
+        # gather what rank 0 needs from the cells of all ranks
         prescribed_fields = [
             self._gather_cells(field) for field in self._prescribed_fields(r) if field.size
         ]
@@ -305,16 +317,15 @@ class SurfaceGatherer:
         # fields that are averaged between the cells at a node
         jet = self._jet(self._model.u, self._reference_nodes, order=1)
         values = self._fields.values_of(jet, state.mu)
-        if state.mu:  # of a mode there are no amplitudes, and no contact
-            nodes_of_cell = len(self._reference_nodes)
-            add_contact(
-                values,
-                self._model,
-                state,
-                lambda of_cells: np.repeat(
-                    of_cells[: self._owned_cells, None], nodes_of_cell, axis=1
-                ),
+
+        def at_cell_nodes(of_cells: Array) -> Array:
+            """Return values (cells, nodes of a cell) of owned cells, from one of each cell."""
+            return np.repeat(
+                of_cells[: self._owned_cells, None], len(self._reference_nodes), axis=1
             )
+
+        if state.mu:  # of a mode there are no amplitudes, and no contact
+            add_contact(values, self._model, state, at_cell_nodes)
         averaged = {
             name: self._averaged(values_at_cells) for name, values_at_cells in values.items()
         }
@@ -331,23 +342,23 @@ class SurfaceGatherer:
             return None
         recovered, jumps = self._recovered.fields(tensors, self._n0)
         fields = self._constant | recovered | rubber_fields(recovered, law) | averaged
+        # contact pressure only where the mesh resolves it
         fields = resolved_pressure(self._cells, fields)
-        names = self._model.midsurface.shells
         return Surface(
-            self._r0,
-            u_at_nodes,
-            self._n0,
-            self._cells,
-            fields,
+            r0=self._r0,
+            u=u_at_nodes,
+            n0=self._n0,
+            cells=self._cells,
+            fields=fields,
             jump=jumps["M"],
             strain_jump=jumps["E"],
-            shells=names,
+            shells=self._model.midsurface.shells,
         )
 
     def _shell_numbers(self) -> Array:
         """Return (cells, nodes) the number of the shell to which each owned cell belongs."""
         midsurface = self._model.midsurface
-        # a mask of cells for each shell: argmax finds the one that has the cell
+        # a mask of cells for each shell: argmax finds the number of the shell that has the cell
         in_shells = [midsurface.patches[name][: self._owned_cells] for name in midsurface.shells]
         numbers = np.argmax(in_shells, axis=0)[:, None].astype(np.float64)
         return np.repeat(numbers, len(self._reference_nodes), axis=1)
@@ -449,6 +460,8 @@ def add_contact(
     ----------
     values
         Name -> (cells, nodes of a cell). The gap to bodies is there already, over h.
+    model, state
+        The model, which computes the pressure and the gap of each cell at the state.
     at_nodes
         Function from a value of each local cell to (cells, nodes of a cell).
     """
@@ -515,6 +528,7 @@ def deviations_at(
     """
 
     def times(deviation: Deviation, factor: float) -> Deviation:
+        """Return a deviation times a factor, as a function of places."""
         return lambda places: factor * deviation(places)
 
     return [
@@ -539,11 +553,13 @@ def completed(surface: Surface, mirror: Array) -> Surface:
     image = _transformed(surface, np.eye(3) - 2 * np.outer(normal, normal))
     image = replace(image, r0=image.r0 + 2 * offset * normal)  # the plane need not pass the origin
 
+    # magnetic fields may be antisymmetric: their image then has the opposite sign
     sign = _parity(surface, normal, offset)
     for name in FIELDS_OF_EITHER_PARITY & surface.fields.keys():
         image.fields[name] *= sign
 
     def with_image(values: Array, values_of_image: Array) -> Array:
+        """Return the values at the nodes of the half, then those at the nodes of its image."""
         return np.concatenate([values, values_of_image])
 
     return Surface(
@@ -565,13 +581,14 @@ def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
     surface_and_image = completed(surface, mirror.plane)
     if not isinstance(mirror, Sector):
         return surface_and_image
-    # half and image are two sectors; images of positive sign are rotations about e3, the identity
-    # among them, which take these two around the axis
+    # the sector and its mirror image are copied around the axis. Those images of the symmetry that
+    # have a positive sign are rotations about e3, the identity among them
     turns = [image.Q.T for image in mirror.images if image.sign > 0]
     copies = [_transformed(surface_and_image, Q) for Q in turns]
     count = len(surface_and_image.r0)
 
     def of_all_copies(values_of: Callable[[Surface], Array]) -> Array:
+        """Return the values that a function takes from a surface, of one copy after the other."""
         return np.concatenate([values_of(copy) for copy in copies])
 
     return replace(
@@ -610,9 +627,10 @@ def on_nodes_of(surface: Surface, target: Surface) -> Surface:
     basis = np.concatenate([ones, offsets / reach[..., None]], axis=2)
     # row 0 of the pseudo-inverse gives the fit's constant, its value at the target node
     fit = np.linalg.pinv(weight * basis, rcond=EXTENT_TOLERANCE)
-    interpolation = fit[:, 0] * weight[..., 0]
+    interpolation = fit[:, 0] * weight[..., 0]  # (target nodes, nearest nodes) factors of values
 
     def interpolated(f: Array) -> Array:
+        """Return values at the target nodes, from values f (n, ...) at the nodes of the surface."""
         return np.asarray(np.einsum("nk,nk...->n...", interpolation, f[nearest_nodes]))
 
     fields = {name: interpolated(f) for name, f in surface.fields.items()}

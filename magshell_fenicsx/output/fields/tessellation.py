@@ -61,8 +61,8 @@ class Tessellation:
 
         Within a cell they have one orientation.
         """
-        tangents = np.matmul(self.slopes[:, None], r[self.nodes])
-        vectors = np.cross(*tangents).reshape(-1, 3)
+        first_tangent, second_tangent = np.matmul(self.slopes[:, None], r[self.nodes])
+        vectors = np.cross(first_tangent, second_tangent).reshape(-1, 3)
         if self.flat:  # the points of a flat triangle are its nodes: sums of normals at each node
             node_numbers, node_count = self.nodes.ravel(), len(r)
             sums = [np.bincount(node_numbers, vectors[:, i], node_count) for i in range(3)]
@@ -83,7 +83,7 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
             basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUISPACED
         )
         in_order = np.arange(9)  # the faces have the element's own order
-        return _divided(faces, element, in_order, _squares(division))
+        return _divided(faces, element, in_order, triangulation=_squares(division))
     count = surface.cells.shape[1]
     # a triangle of degree d has (d + 1)(d + 2)/2 nodes
     degree = round((np.sqrt(8 * count + 1) - 3) / 2)
@@ -92,8 +92,12 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
     )
     order = np.argsort(perm_vtk(CellType.triangle, count))
     # two parts for each interval between nodes show the curvature; flat cells need no division
-    division = 1 if degree == 1 else _division(len(surface.cells), 2 * degree, max_triangles)
-    return _divided(surface.cells, element, order, _triangle(division))
+    division = (
+        1
+        if degree == 1
+        else _division(len(surface.cells), finest=2 * degree, max_triangles=max_triangles)
+    )
+    return _divided(surface.cells, element, order, triangulation=_triangle(division))
 
 
 def _division(triangles: int, finest: int, max_triangles: int) -> int:
@@ -151,7 +155,7 @@ def _triangle(n: int) -> tuple[Array, Numbers]:
 def _squares(n: int) -> tuple[Array, Numbers]:
     """Return points (q, 2) in the reference square, and 2 n² triangles between them."""
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
-    # numbers of the points at the lower left corner of each of the n² squares, and next to it
+    # for each of the n² squares the numbers of its points: lower left, lower right, upper left
     low = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     right, upper = low + 1, low + n + 1
     triangles = np.concatenate(

@@ -113,7 +113,8 @@ def unstructured_grid(
     grid.SetPoints(points)
     cell_type = LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
     grid.SetCells(TRIANGLE if nodes_per_cell == 3 else cell_type, cells)
-    # arrays of the nodes: those of every surface, then its fields, of tensors six components
+    # arrays of the nodes: those that every surface has, then its fields. Of a tensor the six
+    # different components are stored
     values_of_surface = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
     data_of_surface = dict(zip(DATA_OF_SURFACE, values_of_surface, strict=True))
     fields = {
@@ -193,7 +194,7 @@ def is_whole(file: Path) -> bool:
     """Whether a file is VTK's XML with its beginning and its end, and so not cut off."""
     if not file.is_file():
         return False
-    # 200 bytes have the opening element, the last 40 the closing one with white space
+    # the first 200 bytes have the opening element, the last 40 the closing one with white space
     with file.open("rb") as stream:
         head, size = stream.read(200), stream.seek(0, os.SEEK_END)
         stream.seek(max(size - 40, 0))
@@ -220,7 +221,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    # in VTK's data of points, symmetric tensors have six components
+    # fields at the nodes: symmetric tensors, stored with six components, become (3, 3) again
     node_numbers = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     cells = node_numbers.reshape(grid.GetNumberOfCells(), -1)
     point_arrays, file_arrays = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
@@ -231,7 +232,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     }
     if "h_over_R" not in file_arrays:
         raise CaseError(f"{file} is of an earlier version: run the case again")
-    # in VTK's data of the file, each number is an array (1,)
+    # numbers of the whole file, each an array (1,)
     R = float(file_arrays["R_in_m"][0]) if "R_in_m" in file_arrays else nan
     shell_data = ShellData(
         float(file_arrays["h_over_R"][0]),
@@ -239,7 +240,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
         file_arrays.get("mirror"),
         R,
     )
-    # u is stored over h too, and is multiplied by h below
+    # the displacement is taken from u over h, which is stored too, and multiplied by h below
     r0, u_over_h, n0 = (point_arrays[name] for name in ("r0", "u_over_h", "n0"))
     _refuse_unfit_nodes(r0, u_over_h, n0, cells)
     moment_jump, strain_jump = (
@@ -285,6 +286,8 @@ class FieldSeries:
     ----------
     folder
         Folder of the files; made if it is not there.
+    shell_data
+        Data of the shell, which each file has.
     outlines
         Name of a point's file with the outlines of sources and bodies, as a format of the point's
         number; empty if there are none.
@@ -296,7 +299,9 @@ class FieldSeries:
     Attributes
     ----------
     complete_points
-        Number of leading points all of whose files are complete.
+        Number of points, counted from the first, until a file is missing or cut off.
+
+    The field `_rows` has the rows of path.csv of the complete points.
     """
 
     def __init__(
@@ -307,10 +312,7 @@ class FieldSeries:
         rows: Sequence[Mapping[str, Any]] = (),
         grids: Sequence[str] = (),
     ) -> None:
-        """Count the complete points in the folder, and list them in path.pvd.
-
-        `_rows` are the rows of the complete points; without rows of path.csv their numbers alone.
-        """
+        """Count the complete points in the folder, and list them in path.pvd."""
         self._folder, self._shell_data = folder, shell_data
         self._outlines, self._grids = outlines, grids
         folder.mkdir(exist_ok=True)
@@ -320,6 +322,7 @@ class FieldSeries:
             self.complete_points += 1
         if rows:  # a point without a row will be written again
             self.complete_points = min(self.complete_points, len(rows))
+        # without rows of path.csv a row has the number of its point alone
         self._rows: list[Mapping[str, Any]] = list(rows[: self.complete_points]) or [
             {"point": n} for n in range(self.complete_points)
         ]
@@ -456,11 +459,11 @@ def grid_file(name: str, number: int) -> str:
 
 
 def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
-    """Return the content of the .vtu file of a surface; VTK's own writer would ignore a full disk.
+    """Return the content of the .vtu file of a surface, as bytes that the caller writes.
 
-    Names of units, of shells, and the data of `ShellData` are in the file's field data. Its LZ4
-    compression costs almost no time. zlib takes ten times as long and saves only a tenth more on
-    curved surfaces.
+    VTK's own writer of files would ignore a full disk. Names of units, of shells, and the data of
+    `ShellData` are in the file's field data. The content is compressed by LZ4, which costs almost
+    no time. zlib takes ten times as long and saves only a tenth more on curved surfaces.
     """
     grid = unstructured_grid(surface, shell_data.h)
     # numbers and vectors of the whole file; what is None is left out

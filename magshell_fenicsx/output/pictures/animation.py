@@ -7,7 +7,7 @@ the point whose displacement the column w_pole_over_h has. Lengths of the layout
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -87,6 +87,8 @@ def animated(
         Thickness over R.
     rows
         All rows of the path.
+    camera
+        Projection of the shell.
     pole
         Name of the point of w_pole_over_h.
     """
@@ -105,7 +107,7 @@ def animated(
         _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither))
         for frame in frames
     )
-    # ms, in multiples of ten, which GIF files count
+    # ms, in multiples of ten: GIF files count hundredths of a second
     duration = round(max(1000 * DURATION / len(frames), MIN_FRAME_DURATION), -1)
     durations = [*[duration] * len(further_images), DURATION_OF_LAST]
     content = io.BytesIO()
@@ -149,14 +151,14 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     """
     from PIL import Image as Pillow
 
-    # each colour once, so that rare colours count as much as frequent ones
+    # each colour of the frames once, so that rare colours count as much as frequent ones
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    levels = list[int]()
+    levels = list[int]()  # red, green and blue of each entry, one after the other
     for method in methods:
         levels += colours.quantize(COLOURS, method).getpalette() or []
-    palette.putpalette([*WHITE, *levels[3:]])  # white in place of the first three levels
+    palette.putpalette([*WHITE, *levels[3:]])  # white in place of the first entry
     return palette
 
 
@@ -228,17 +230,8 @@ def _composed(
     colour_bar(figure, box(shell_width + 30, 90, 16, height - 180), views[0].scale, "vertical")
     figure.text(15 / width, 12 / height, _scale(factor))
     directions(box(shell_width - 60, 4, 70, 70), views[0].camera, STYLE)
-    steps = list[CurveStep]()
-    if rows[-1]["amplitude"]:
-        steps = curve_steps(rows, str(rows[-1]["amplitude"]))[-MAX_CURVES:]
-    height_of_curve = (height - 70) // max(len(steps), 1)
-    markers: dict[int, tuple[Axes, CurveStep, Line2D]] = {}
-    for i, step in enumerate(reversed(steps)):  # from below
-        axes = box(shell_width + 230, 70 + i * height_of_curve, 350, height_of_curve - 70)
-        plot_curve(axes, step, pole)
-        # without places yet: `animated` leaves it out of the fixed parts
-        (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
-        markers |= {int(row["point"]): (axes, step, marker) for row in step.rows}
+    markers = _draw_curves(box, shell_width + 230, height, rows, pole)
+    # artists that are "animated" are left out of the fixed parts
     title = figure.text(15 / width, 1 - 12 / height, "", va="top", animated=True)
     canvas.draw()
     fixed_parts = canvas.copy_from_bbox(figure.bbox)
@@ -248,19 +241,64 @@ def _composed(
         title.set_text(text)
         figure.draw_artist(title)
         if row["point"] in markers:
-            axes, step, marker = markers[int(row["point"])]
-            marker.set_data(*([x] for x in curve_coordinates(row, step.amplitude)))
-            axes.draw_artist(marker)
+            _draw_marker(*markers[int(row["point"])], row)
         frame = np.array(canvas.buffer_rgba())[:, :, :3]
-        # rows of an image go downwards
+        # the place of the shell in the frame; rows of an image go downwards
         shell_rows = slice(height - shell_low - shell_height, height - shell_low)
         _overlay(view.image, frame[shell_rows, 10 : 10 + shell_width])
         frames.append(frame)
     return frames
 
 
+def _draw_curves(
+    box: "Callable[[float, float, float, float], Axes]",
+    left: float,
+    height: float,
+    rows: Sequence[Row],
+    pole: str,
+) -> "dict[int, tuple[Axes, CurveStep, Line2D]]":
+    """Draw the curves of the last steps above each other, and return where points have markers.
+
+    Parameters
+    ----------
+    box
+        Function from left, low, width and height of a box in pixels to axes in it.
+    left, height
+        Left side of the axes, and height of the figure, in pixels.
+    rows
+        All rows of the path.
+    pole
+        Name of the point of w_pole_over_h in a case without named points.
+
+    Returns
+    -------
+    Number of a point -> axes, step and marker of its curve. Markers have no places yet.
+    """
+    steps = list[CurveStep]()
+    if rows[-1]["amplitude"]:
+        steps = curve_steps(rows, str(rows[-1]["amplitude"]))[-MAX_CURVES:]
+    height_of_curve = (height - 70) // max(len(steps), 1)
+    markers: dict[int, tuple[Axes, CurveStep, Line2D]] = {}
+    for i, step in enumerate(reversed(steps)):  # from below
+        axes = box(left, 70 + i * height_of_curve, 350, height_of_curve - 70)
+        plot_curve(axes, step, pole)
+        (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
+        markers |= {int(row["point"]): (axes, step, marker) for row in step.rows}
+    return markers
+
+
+def _draw_marker(axes: "Axes", step: CurveStep, marker: "Line2D", row: Row) -> None:
+    """Draw the marker of a curve at a row of path.csv on the canvas."""
+    x, y = curve_coordinates(row, step.amplitude)
+    marker.set_data([x], [y])
+    axes.draw_artist(marker)
+
+
 def _overlay(image: Image, frame: NDArray[np.uint8]) -> None:
-    """Draw an image (n, m, 4) with transparency over a part of a frame (n, m, 3), in place."""
+    """Draw an image (n, m, 4) with transparency over a part of a frame (n, m, 3), in place.
+
+    A thin grey line is drawn around what the image shows.
+    """
     opacity = image[..., 3:] / 255
     overlaid = opacity * image[..., :3] + (1 - opacity) * frame
     edge = EDGE_OPACITY * edge_of(opacity)

@@ -1,9 +1,11 @@
 """Bodies and magnets near a shell in a picture, and names of those that are too far.
 
 Bodies are drawn as glass, magnets with a red north and a blue south pole. A `Solid` has corners and
-triangles, and of a magnet a pole strength at each corner, positive on its north half. A source of
-the field without faces, such as a coil, is drawn by its outlines. Depth grows towards the eye; it
-is -inf where nothing is drawn. A drawn pixel is finer than a pixel of the picture.
+triangles, and of a magnet a pole strength at each corner, positive on its north half. Its creases
+are lines along sharp edges. A source of the field without faces, such as a coil, is drawn by its
+outlines. Depth grows towards the eye; it is -inf where nothing is drawn. A drawn pixel is finer
+than a pixel of the picture: `in_pixels` gives the fraction of each pixel that some drawn ones
+cover. A rendered surface `shows` places that it does not hide, up to a tolerance of the depth.
 """
 
 from collections.abc import Sequence
@@ -74,6 +76,10 @@ class BodiesInView:
 
     Parameters
     ----------
+    surface
+        The deformed shell with all solids.
+    camera, window
+        The projection, and the part of it that the picture shows.
     shell
         The shell rendered in the same window.
     """
@@ -113,18 +119,17 @@ class BodiesInView:
     @cached_property
     def images(self) -> list[SolidImage]:
         """Images of all solids, to be drawn over an image of the shell."""
-        behind, images = self._shell.depth > -np.inf, []
+        has_shell, images = self._shell.depth > -np.inf, []
         for solid, view, visible in zip(self._solids, self._views, self._visible, strict=True):
             opacity_alone, opacity_over_shell = (
                 OPACITIES_OF_BODIES if solid.poles is None else OPACITIES_OF_MAGNETS
             )
-            # parts of each pixel that the solid covers, without and with the shell behind it
-            covered_alone, covered_over_shell = (
-                in_pixels(visible & ~behind),
-                in_pixels(visible & behind),
-            )
+            # fractions of each pixel that the solid covers, without and with the shell behind it
+            covered_alone = in_pixels(visible & ~has_shell)
+            covered_over_shell = in_pixels(visible & has_shell)
             opacity = opacity_alone * covered_alone + opacity_over_shell * covered_over_shell
-            # a magnet's colours change at pole strength zero, in the middle of the limits
+            # a body has one colour. A magnet has two, which change at pole strength zero, in the
+            # middle of the limits
             table = np.array([BODY] if solid.poles is None else [SOUTH, NORTH])
             values = np.zeros(len(solid.points)) if solid.poles is None else solid.poles
             largest = float(np.abs(values).max()) or 1.0
@@ -140,21 +145,26 @@ class BodiesInView:
         import contourpy
 
         left, _, _, high = self._window.box
+        upper_left_corner, downwards = np.array([left, high]), np.array([1, -1])
         lines = list[Array]()
         for solid, view, visible in zip(self._solids, self._views, self._visible, strict=True):
-            # a frame of equal values: no line where the solid goes on beyond the window
+            # the outline of the solid: where it covers half of a pixel. A frame of equal values
+            # around the image gives no line where the solid goes on beyond the window
             padded = np.pad(in_pixels(visible), 1, mode="edge")
             contours: Any = contourpy.contour_generator(z=padded).lines(0.5)
             # from pixels of the padded image, centred at whole numbers, to the projection
             lines += [
-                np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale
+                upper_left_corner + (line - 0.5) * downwards / self._window.scale
                 for line in contours
             ]
-            lines += self._edges(solid, view)
+            lines += self._visible_creases(solid, view)
         return lines
 
-    def _edges(self, solid: Solid, view: RenderedSurface) -> list[Array]:
-        """Return the visible parts of a solid's creases (n, 2), with nan between them."""
+    def _visible_creases(self, solid: Solid, view: RenderedSurface) -> list[Array]:
+        """Return the visible parts of a solid's creases as a line (n, 2) with nan between them.
+
+        The list is empty for a solid without creases. `view` is the solid rendered alone.
+        """
         if not (creases := solid.creases):
             return []
         divided_lines = [_divided(line) for line in creases]
@@ -169,7 +179,10 @@ class BodiesInView:
 
     @property
     def poles(self) -> list[tuple[float, float, str]]:
-        """(x, y, letter) of the visible poles N and S of magnets, in the projection."""
+        """(x, y, letter) of the visible poles N and S of magnets, in the projection.
+
+        A letter is in the middle of the pole's faces that are turned to the eye.
+        """
         letters = []
         for solid, view in zip(self._solids, self._views, strict=True):
             if solid.poles is None:
@@ -182,7 +195,8 @@ class BodiesInView:
                 if not len(centres_of_pole):
                     continue
                 middle = centres_of_pole.mean(axis=0)
-                if self._shell.shows(middle[None], 0.0)[0]:  # the shell does not hide it
+                (is_visible,) = self._shell.shows(middle[None], 0.0)  # the shell may hide it
+                if is_visible:
                     x, y = self._camera(middle)[:2]
                     letters.append((float(x), float(y), letter))
         return letters
@@ -233,6 +247,7 @@ def bare_outlines(surface: Surface) -> tuple[Array, ...]:
     boxes = [(np.min(points, axis=0), np.max(points, axis=0)) for points in corners]
 
     def is_in_a_box(line: Array) -> bool:
+        """Whether a line is within the box around one of the solids, whose outline it then is."""
         return any(
             bool(((line >= low - BOX_TOLERANCE) & (line <= high + BOX_TOLERANCE)).all())
             for low, high in boxes

@@ -1,9 +1,9 @@
 """Numbers beside marks of curves, and captions under pictures.
 
 A row is a line of path.csv, by column. An amplitude is a load parameter, by name; its value is in
-the column of the amplitude. Lengths on a picture are in points, 1/72 inch. In the code `half` is
-half the width and height of a text, as a box around its middle. lambda_m measures the magnetic
-field; h, R and nu are thickness, reference length and Poisson's ratio.
+the column of the amplitude. Lengths on a picture are in points, 1/72 inch. A text is a box with a
+middle and half a size, that is half of its width and height. lambda_m measures the magnetic field;
+h, R and nu are thickness, reference length and Poisson's ratio.
 """
 
 from collections.abc import Iterable, Sequence
@@ -49,11 +49,12 @@ def write_numbers(
 
     if not marks:
         return
+    # the axes over the figure, and the figure, which gives its size
     box, figure = axes.get_position(), axes.get_figure(root=True)
     assert figure
     figure_width, figure_height = 72 * figure.get_size_inches()
     font_size, (left, right), (low, high) = rcParams["font.size"], axes.get_xlim(), axes.get_ylim()
-    # of the axes, in points
+    # size of the axes, in points
     extent = np.array([box.width * figure_width, box.height * figure_height])
 
     def in_points(places: Array) -> Array:
@@ -67,26 +68,16 @@ def write_numbers(
     # boxes (middle, half of the size) that texts must not cover: marks, later texts too
     occupied = [(place, np.full(2, HALF_MARK)) for place in places_of_marks]
     for i, (_, text) in enumerate(marks):
-        place: Array = places_of_marks[i]
         half_size = np.array([DIGIT_WIDTH * len(text), DIGIT_HEIGHT]) * font_size / 2
-        middles = [
-            place + np.array(direction) * (half_size + MARK_DISTANCE)
-            for direction in TEXT_DIRECTIONS
-        ]
-        free_middles = [
-            middle
-            for middle in middles
-            if _is_inside(middle, half_size, extent) and _is_free(middle, half_size, occupied)
-        ]
-        if not free_middles:
-            continue
-        best_middle = min(
-            free_middles, key=partial(_fault, place, half_size, places_of_marks, points_of_curves)
+        middle = _best_middle(
+            i, half_size, places_of_marks, points_of_curves, occupied=occupied, extent=extent
         )
-        occupied.append((best_middle, half_size))
+        if middle is None:  # no room for this text
+            continue
+        occupied.append((middle, half_size))
         axes.text(
-            best_middle[0] / extent[0],
-            best_middle[1] / extent[1],
+            middle[0] / extent[0],
+            middle[1] / extent[1],
             text,
             transform=axes.transAxes,
             ha="center",
@@ -94,23 +85,65 @@ def write_numbers(
         )
 
 
-def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) -> tuple[int, int]:
-    """Return the faults of a place for a mark's number: (nearer marks, covered points of curves).
+def _best_middle(
+    number: int,
+    half_size: Array,
+    marks: Array,
+    curves: Array,
+    occupied: Sequence[tuple[Array, Array]],
+    extent: Array,
+) -> Array | None:
+    """Return the middle (2,) of a mark's text where it disturbs least; None if it has no room.
 
-    Fewer nearer marks, to which a reader would relate the number, count before points of curves.
+    All lengths and places are in points.
 
     Parameters
     ----------
-    place, half
-        (2,) the mark, and half the size of the text.
-    marks, line
+    number
+        Number of the mark.
+    half_size
+        (2,) half the size of the text.
+    marks, curves
+        (n, 2) places of all marks, and points of all curves.
+    occupied
+        Boxes that the text must not cover: middle and half of the size, (2,) each.
+    extent
+        (2,) size of the axes, within which the text must be.
+    """
+    mark: Array = marks[number]
+    middles = [
+        mark + np.array(direction) * (half_size + MARK_DISTANCE) for direction in TEXT_DIRECTIONS
+    ]
+    free_middles = [
+        middle
+        for middle in middles
+        if _is_inside(middle, half_size, extent) and _is_free(middle, half_size, occupied)
+    ]
+    if not free_middles:
+        return None
+    return min(free_middles, key=partial(_faults, mark, half_size, marks, curves))
+
+
+def _faults(
+    mark: Array, half_size: Array, marks: Array, curves: Array, middle: Array
+) -> tuple[int, int]:
+    """Return how much a text beside a mark disturbs: (nearer marks, covered points of curves).
+
+    A reader would relate the text to a nearer mark. Such marks count first: tuples are compared by
+    their first numbers.
+
+    Parameters
+    ----------
+    mark, half_size
+        (2,) the mark of the text, and half the size of the text.
+    marks, curves
         (n, 2) all marks, and points of all curves.
     middle
         (2,) middle of the text; all in points.
     """
-    distance_from_own_mark = np.linalg.norm(place - middle)
+    distance_from_own_mark = np.linalg.norm(mark - middle)
     is_nearer = np.linalg.norm(marks - middle, axis=1) < distance_from_own_mark - ROUNDING
-    is_covered = (np.abs(line - middle) < half).all(axis=1)
+    is_covered = (np.abs(curves - middle) < half_size).all(axis=1)
     return int(is_nearer.sum()), int(is_covered.sum())
 
 

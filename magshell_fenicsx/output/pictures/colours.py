@@ -3,9 +3,11 @@
 A field that is zero or unknown is named in a note and not drawn.
 
 Input: a `Surface`, the deformed shell with fields at its nodes. Output: for each panel of a picture
-a `ColouredField`, and a note for its foot. E_1, E_2, M_1, M_2 are principal values of membrane
-strain and bending moment. The jump of a field is the difference of the cells' own values from the
-smooth field that is drawn, relative; it measures the noise of the mesh. Br and Ba are remanence and
+a `ColouredField`, and a note for its foot. Limits are the values at the ends of the colours.
+
+E_1, E_2, M_1, M_2 are principal values of membrane strain and bending moment. The jump of strains
+or moments is the rms of the difference between the cells' own values and the smooth field that is
+drawn, over the rms of the field; it measures the noise of the mesh. Br and Ba are remanence and
 applied magnetic field, h and R thickness and reference length, E is Young's modulus, D the bending
 stiffness.
 """
@@ -95,13 +97,13 @@ class ColouredField:
     Attributes
     ----------
     name
-        Name of the field, see `surface.Surface`.
+        Name of the field in the surface; empty for a grey shell.
     values
         (n,) at the nodes.
     limits
         Values at the ends of the colours.
     colours
-        Name of the colour map, see `scales.colour_map`; empty for grey.
+        Name of the colour map: `SIGNED`, `DISTANCE` or one of matplotlib's; empty for grey.
     caption
         Caption of the colour bar.
     """
@@ -153,7 +155,7 @@ def unresolved_strains_note(surface: Surface, h: float) -> str:
     jump = surface.strain_jump or 0.0
     if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or jump < UNRESOLVED_JUMP:
         return ""
-    # M/(D/R) is about a change of curvature over 1/R: times half of h the strain at the faces
+    # M R/D is about R times a change of curvature; times h/2, over R, it is the strain at the faces
     membrane, bending = _largest(surface, STRAINS), h / 2 * _largest(surface, MOMENTS)
     if not 0 < membrane < SMALL_STRAIN * bending:
         return ""
@@ -191,7 +193,7 @@ def jump_note(jump: float | None, quantities: str) -> str:
     Parameters
     ----------
     jump
-        Their relative difference, see `recovery.relative_jump`; None gives an empty note.
+        Rms of their difference over the rms of the field; None gives an empty note.
     quantities
         "strains" or "moments".
     """
@@ -229,20 +231,21 @@ def _principal(
         return [], []
     first_name, second_name = captions
     # LIMIT_OVER_NOISE times the noise of the mesh: with that limit of colours the noise is pale
-    limit_of_noise = _noise(surface, first_name, second_name, jump or 0.0)
-    limit = max(_limit(surface, first_name, second_name), limit_of_noise)
+    limit_of_noise = _limit_far_above_noise(surface, first_name, second_name, jump or 0.0)
+    limit = max(_limit_without_peaks(surface, first_name, second_name), limit_of_noise)
     fields, notes = list[ColouredField](), list[str]()
     magnitudes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
     for name, caption in captions.items():
         values = surface.fields[name]
+        words, _, _ = caption.partition(" $")  # the caption without the symbol
         if magnitudes[name] < ZERO_FRACTION * max(magnitudes.values()):
-            notes.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
+            notes.append(f"The {words} is zero everywhere.")
             continue
         rms = float(np.sqrt((values**2).mean()))
         if rms < limit_of_noise / LIMIT_OVER_NOISE:
-            notes.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
+            notes.append(f"The {words} is zero but for the mesh.")
             continue
-        # the common limit, on the sides of zero on which the field has values
+        # the common limit on each side of zero, and zero on a side where the field has no values
         lowest, highest = from_zero(float(values.min()), float(values.max()), ZERO_FRACTION)
         limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
         if max(magnitudes.values()) < ZERO_STRESS[first_name]:  # both are zero: white
@@ -251,20 +254,20 @@ def _principal(
     return fields, notes
 
 
-def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
+def _limit_far_above_noise(surface: Surface, first: str, second: str, jump: float) -> float:
     """Return a colour limit far above the noise of the mesh in two principal fields.
 
-    With it a field that is zero but for the mesh is pale. `jump` is the relative difference of the
-    cells' own values from the smooth fields.
+    With it a field that is zero but for the mesh is pale. `first` and `second` are the names of the
+    fields. `jump` is the relative difference of the cells' own values from the smooth fields.
     """
     squares = surface.fields[first] ** 2 + surface.fields[second] ** 2
     return LIMIT_OVER_NOISE * jump * float(np.sqrt(squares.mean()))
 
 
-def _limit(surface: Surface, first: str, second: str) -> float:
+def _limit_without_peaks(surface: Surface, first: str, second: str) -> float:
     """Return the colour limit of two fields: their largest magnitude, without peaks of small area.
 
-    Such a peak is at a point load, for instance.
+    Such a peak is at a point load, for instance. `first` and `second` are the names of the fields.
     """
     magnitude = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
     if (largest := float(magnitude.max())) < ZERO_STRESS[first]:
@@ -296,7 +299,10 @@ def couple(surface: Surface) -> Array | None:
 
 
 def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
-    """Return the magnetic loads that are not zero everywhere, and a note on the others."""
+    """Return the magnetic loads that are not zero everywhere, and a note on the others.
+
+    Loads do not depend on the thickness `h` in their units, so it is not used here.
+    """
     fields = surface.fields
     magnetic_couple = couple(surface)
     if magnetic_couple is None:

@@ -2,14 +2,15 @@
 
 A row is a line of path.csv: one point of the path. A step (`CurveStep`) has the rows of one load
 step; a line (`Line`) those of one branch, drawn as a smooth curve with SEGMENTS_PER_INTERVAL
-segments between two rows. A located row is a fold or a bifurcation, with the label of that name; a
-crossing is one at which a mode that the model excludes becomes neutral. An amplitude is a load
-parameter, by name; it is one coordinate of a curve, a displacement the other. The pole is the point
-of the column w_pole_over_h.
+segments between two rows. A located row is a fold or a bifurcation, with the label of that name
+(`LOCATED`); a crossing is one at which a mode that the model excludes becomes neutral. A solution
+is what a search found, with the label `SOLUTION`. An amplitude is a load parameter, by name; it is
+one coordinate of a curve, a displacement the other. The pole is the point of the column
+w_pole_over_h. A frequency has omega2 = ω² ρ R²/E, with the angular frequency ω.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -128,11 +129,16 @@ def _figure_with_cells(
 
 def worth_drawing(parts: Sequence[CurveStep]) -> list[CurveStep]:
     """Return the steps whose curve is not a single straight line, and always the last step."""
-    # the widest curve over each quantity of an x axis says what is noise there
+    # name of the quantity on the x axis of each step
+    names = list[str]()
+    for step in parts:
+        x_quantity, _ = axes_for(step)
+        names.append(x_quantity.name)
+    # the width of the widest curve over each quantity; far narrower curves are noise
     widths: dict[str, float] = defaultdict(float)
-    names = [axes_for(step)[0].name for step in parts]
     for name, step in zip(names, parts, strict=True):
-        widths[name] = max(widths[name], float(np.ptp(_points(step)[0])))
+        x, _ = _points(step)
+        widths[name] = max(widths[name], float(np.ptp(x)))
     bent_steps = (
         step
         for name, step in zip(names[:-1], parts[:-1], strict=True)
@@ -166,7 +172,8 @@ def _bends(step: CurveStep, min_width: float) -> bool:
 def legend(figure: "Figure", max_columns: int) -> None:
     """Draw one legend above all axes of a figure, where it covers no curve.
 
-    Equal names are one entry; `max_columns` is the largest number of entries in a row.
+    Equal names are one entry; `max_columns` is the largest number of entries in a row. The figure
+    must have a layout that leaves room above the axes.
     """
     entries = dict[str, Any]()
     for axes in figure.axes:
@@ -196,6 +203,7 @@ def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
     curves = draw_lines(axes, step)
     instabilities = [row for row in step.rows if row["label"] in LOCATED]
     solutions = [row for row in step.rows if row["label"] == SOLUTION]
+    # squares at solutions, filled if they are stable
     for row in solutions:
         name, fill = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
@@ -246,10 +254,10 @@ def draw_lines(
     # which coordinate is the amplitude and has its extreme at a fold; of other curves unknown
     load_coordinate = None if place_of else load_axis(step.amplitude)
     for line in line_coordinates(step):
-        curve = line.smooth_curve(
-            *zip(*map(coordinates, line.rows), strict=True), load_axis=load_coordinate
-        )
+        x, y = zip(*map(coordinates, line.rows), strict=True)
+        curve = line.smooth_curve(x, y, load_axis=load_coordinate)
         curves.append(curve)
+        # instabilities by modes that the model excludes: they are between the rows of the line
         crossings = [row for row in step.rows if row["label"] in LOCATED and row not in line.rows]
         segments = _segments(line, curve, crossings, coordinates)
         # consecutive segments that are all stable or all unstable are one drawn line
@@ -308,10 +316,12 @@ def _segments(
         crossings_between = [
             crossing for crossing in crossings if number < int(crossing["point"]) < next_number
         ]
-        # the first row has another stability than the interval, and is no instability itself
+        # whether the stability changes between the two rows: the first row, if it is no instability
+        # itself, has another stability than the interval, which is as stable as the next row
         changes = row["label"] not in LOCATED and is_unstable(row) != unstable
         if crossings_between and changes:
-            # becoming unstable the path changes at the first crossing, becoming stable at the last
+            # a path that becomes unstable does so at the first crossing between the rows; one that
+            # becomes stable does so at the last one
             crossing_place = np.array(place_of(crossings_between[0 if unstable else -1]))[:, None]
             offsets = (curve[:, low : high + 1] - crossing_place) / extent
             middle = low + int(np.argmin(np.linalg.norm(offsets, axis=0)))
@@ -375,7 +385,7 @@ def _corner_of_inset(axes: "Axes") -> tuple[float, float] | None:
     places = axes.transAxes.inverted().transform(axes.transData.transform(points))
     far_side = 0.97 - INSET_SIZE  # a margin of 0.03
     corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
-    covered = list[float]()  # part of the points that each inset covers
+    covered = list[float]()  # fraction of the points that an inset at each corner covers
     for corner in np.array(corners) - INSET_GAP:  # with room for numbers, left and below
         is_covered = (places > corner) & (places < corner + INSET_SIZE + INSET_GAP)
         covered.append(float(is_covered.all(axis=1).mean()))
@@ -424,35 +434,27 @@ def frequencies_figure(
     varied_amplitudes = (str(row["amplitude"]) for row in reversed(rows) if row["amplitude"])
     name = next(varied_amplitudes, "")
     column = shown_quantity(registered(name).column, rows[0]) if name else None
-    places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
-    shown = [frequency for frequency in frequencies if frequency.point in places]
+    # number of a point -> value of the amplitude that varied last
+    load_by_point = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
+    shown = [frequency for frequency in frequencies if frequency.point in load_by_point]
     is_one_point = len({frequency.point for frequency in shown}) == 1
     over_waves = all(f.wave.isdigit() for f in shown if f.wave != TORSION)
     hertz_per_root = _hertz_per_root(frequencies)
 
     abscissae: Sequence[float]
     if not is_one_point:
-        abscissae = [places[f.point] for f in shown]
+        abscissae = [load_by_point[f.point] for f in shown]
     elif over_waves:  # torsion has no waves
         abscissae = [int(f.wave) if f.wave.isdigit() else 0 for f in shown]
     else:
         abscissae = range(1, len(shown) + 1)
+    # (wave, rank) -> places (x, y) of a line; the lowest frequency of a wave has the rank 0
     lines = _lines_of_frequencies(shown, abscissae, hertz_per_root)
 
     width = (style.width or ONE_COLUMN) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
-    axes, waves = figure.subplots(), list(dict.fromkeys(wave for wave, _ in lines))
-    # over numbers of waves: all waves have one colour, torsion another
-    if is_spectrum := is_one_point and over_waves:
-        waves = ["waves", *({TORSION} & set(waves))]
-    for (wave, rank), points in lines.items():
-        wave = "waves" if is_spectrum and wave != TORSION else wave
-        number = waves.index(wave)
-        label = wave if rank == 0 and number < MAX_NAMED_WAVES else None
-        axes.plot(
-            *zip(*points, strict=True), ".-", color=f"C{number % 10}", label=label, lw=1, ms=4
-        )
-    axes.axhline(0, color="0.6", lw=0.6)
+    axes = figure.subplots()
+    waves = _draw_frequencies(axes, lines, in_one_colour=is_one_point and over_waves)
     has_unstable = any(frequency.omega2 < 0 for frequency in frequencies)
     if hertz_per_root:
         axes.set(ylabel="frequency  (Hz)" + ("; below zero it grows" if has_unstable else ""))
@@ -468,6 +470,35 @@ def frequencies_figure(
     return figure
 
 
+def _draw_frequencies(
+    axes: "Axes",
+    lines: Mapping[tuple[str, int], Sequence[tuple[float, float]]],
+    *,
+    in_one_colour: bool,
+) -> list[str]:
+    """Draw lines of frequencies in axes, and return the names of their colours in the legend.
+
+    Parameters
+    ----------
+    lines
+        (wave, rank) -> places (x, y) of a line. Each wave has a colour, for lines of all ranks.
+    in_one_colour
+        Whether all waves have one colour, named "waves", and torsion another.
+    """
+    waves = list(dict.fromkeys(wave for wave, _ in lines))
+    if in_one_colour:
+        waves = ["waves", *({TORSION} & set(waves))]
+    for (wave, rank), points in lines.items():
+        wave = "waves" if in_one_colour and wave != TORSION else wave
+        number = waves.index(wave)
+        label = wave if rank == 0 and number < MAX_NAMED_WAVES else None
+        axes.plot(
+            *zip(*points, strict=True), ".-", color=f"C{number % 10}", label=label, lw=1, ms=4
+        )
+    axes.axhline(0, color="0.6", lw=0.6)
+    return waves
+
+
 def _lines_of_frequencies(
     frequencies: Sequence[Frequency], abscissae: Sequence[float], hertz_per_root: float
 ) -> dict[tuple[str, int], list[tuple[float, float]]]:
@@ -481,10 +512,10 @@ def _lines_of_frequencies(
     frequencies, abscissae
         Frequencies, ascending at each point, and the abscissa of each.
     hertz_per_root
-        See `_hertz_per_root`; if it is 0, values are omega2.
+        Frequency in Hz of omega2 = 1. If it is 0, ordinates are omega2 itself.
     """
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
-    count = defaultdict[tuple[int, str], int](int)
+    count = defaultdict[tuple[int, str], int](int)  # by point and wave: frequencies so far
     for frequency, abscissa in zip(frequencies, abscissae, strict=True):
         value = omega2 = frequency.omega2
         if hertz_per_root:

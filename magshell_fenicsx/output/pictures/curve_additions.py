@@ -84,10 +84,11 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
         figure = Figure(figsize=(width, 0.8 * width), dpi=style.dpi, layout="constrained")
         axes = figure.subplots()
         for i, (name, step) in enumerate(zip(labels(cases), steps.values(), strict=True)):
-            number = i % 10  # matplotlib has ten colours
-            colour = f"C{number if number < 3 else number + 1}"  # C3 is that of the marks
+            # matplotlib's ten colours are C0 to C9, then C10 is C0 again; C3 is that of the marks
+            number = i % 10
+            colour = f"C{number if number < 3 else number + 1}"
             draw_lines(axes, step, colour)
-            axes.plot([], [], color=colour, lw=1.2, label=name)
+            axes.plot([], [], color=colour, lw=1.2, label=name)  # an empty line, for the legend
         pole = pole_of(cases[first_folder])
         x_label, y_label = (
             with_point_name(axis_quantity, first_step.rows[0], pole, r"\$").label
@@ -102,7 +103,13 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
 
 
 def _last_step(folder: Path, rows: Sequence[Row]) -> CurveStep:
-    """Return the last step of a run's path; CaseError if nothing has varied."""
+    """Return the last step of a run's path.
+
+    Raises
+    ------
+    CaseError
+        If no amplitude has varied, so that there is no curve.
+    """
     path = [row for row in rows if row["label"] != SOLUTION]
     if not path or not path[-1]["amplitude"]:
         raise CaseError(f"{folder}: has no curve: nothing has varied")
@@ -152,7 +159,7 @@ def _flat(section: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def _key_words(key: str) -> str:
     """Return the symbol of the quantity with the name of a key, else the name in words."""
-    name = key.rpartition(".")[2]
+    _, _, name = key.rpartition(".")
     return QUANTITIES[name].latex if name in QUANTITIES else name.replace("_", " ")
 
 
@@ -181,8 +188,12 @@ def add_shapes(
         Figure with one curve for each step, in this order.
     shapes
         Row of path.csv of each point, and the deformed shell there.
+    style
+        Not used here.
+    camera
+        Projection of all shells.
     """
-    # for each shape the last step that has its row; None if no curve has it
+    # for each shape the number of the last curve that has its row; None if no curve has it
     curve_numbers = [
         next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
         for row, _ in shapes
@@ -227,8 +238,9 @@ def _shell_image(
         Width and height of the axes in pixels.
     """
     axes_width, axes_height = axes_size
-    # of a window of 1000 pixels
-    height_over_width = Window.around(places, 1000).shape[0] / 1000
+    # proportions of the common window, from one that is 1000 pixels wide
+    height_in_pixels, _ = Window.around(places, 1000).shape
+    height_over_width = height_in_pixels / 1000
     room = min(MAX_WIDTH * axes_width, MAX_HEIGHT * axes_height / height_over_width)
     width = max(int(room), 8)
     window = Window.around(places, width)
@@ -254,7 +266,7 @@ def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Ar
         "shrinkA": 0,
         "shrinkB": MARK_SIZE / 2,
     }
-    # the line: from the point of the data to the nearest pixel of the image
+    # the line: from the point of the data to the nearest drawn pixel of the image
     end = _nearest(axes, image, point, corner, size)
     begin = (float(point[0]), float(point[1]))
     axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line_style, zorder=3)
@@ -326,7 +338,7 @@ def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Arr
         distance = np.linalg.norm(low + size / 2 - target)
         return float(COST_OF_CURVE * covered + COST_OF_SHELL * overlap + distance)
 
-    # abscissae and ordinates of the corners that are tried
+    # abscissae, then ordinates, of the corners that are tried
     positions = (
         np.linspace(MARGIN, max(1 - MARGIN - length, MARGIN), PLACES_PER_SIDE) for length in size
     )

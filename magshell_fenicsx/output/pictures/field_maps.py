@@ -1,9 +1,10 @@
 """Maps of the magnetic field on planes: its lines and |B|, with the section of the shell.
 
 A `MapGrid` has a corner, two sides (a plane) or three (a box), numbers of points along them, and
-the flux density B at the points, the first side's points fastest; places are over the reference
-length R, which is nan for a case without units. A section is the set of lines in which a plane
-meets a surface.
+the flux density B at the points, which are numbered along the first side, then along the next one;
+places are over the reference length R. A case without units has no R in metres: nan stands for it.
+A section is the set of lines in which a plane meets a surface. In a picture the first side of a
+plane is to the right, the second one up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,9 +72,9 @@ def field_maps_figure(
     row_count = -(-len(shown_maps) // panels_per_row)  # rounded up
     width = (style.width or (ONE_COLUMN if panels_per_row == 1 else TWO_COLUMNS)) / INCH
     with drawing(style):
-        lengths = [np.linalg.norm(grid.sides, axis=1) for grid, _ in shown_maps]
-        # of the tallest map: all rows have one height
-        ratio = max(float(second / first) for first, second, *_ in lengths)
+        side_lengths = [np.linalg.norm(grid.sides, axis=1) for grid, _ in shown_maps]
+        # height over width of the tallest map, since all rows have one height
+        ratio = max(float(second / first) for first, second, *_ in side_lengths)
         row_height = MARGIN + MAP_WIDTH * min(ratio, MAX_MAP_HEIGHT) * width / panels_per_row
         figure = Figure(
             figsize=(width, row_height * row_count), dpi=style.dpi, layout="constrained"
@@ -110,7 +111,7 @@ def section(surface: Surface, grid: MapGrid) -> Array:
     # places on the plane are on one side of it, in all cells
     height = np.where(np.abs(height) < PLANE_TOLERANCE, PLANE_TOLERANCE, height)
     corners, heights = places[tessellation.triangles], height[tessellation.triangles]
-    crossed = np.abs(np.sign(heights).sum(axis=1)) < 3  # not three corners on one side
+    crossed = np.abs(np.sign(heights).sum(axis=1)) < 3  # whether corners are on both sides
     corners, heights = corners[crossed], heights[crossed]
     # the corner that is alone on its side of the plane: the lowest one if two are above
     two_are_above = np.sign(heights).sum(axis=1) > 0
@@ -141,13 +142,12 @@ def _draw(
     case
         The case of summary.json.
     """
-    from matplotlib.collections import PolyCollection
-    from matplotlib.patches import PathPatch
-
+    # factor from values of B in the grid to the drawn unit, and its name
     size_of_unit, unit = unit_of(case)
     length_of_R = 1.0 if isnan(R) else 1e3 * R  # in mm, or in R itself
     directions = grid.sides / np.linalg.norm(grid.sides, axis=1)[:, None]
     nx, ny = grid.points
+    # coordinates of the points along both sides, in the unit of the picture
     x, y = (
         length_of_R * (e @ grid.corner + np.linspace(0, np.linalg.norm(side), n))
         for e, side, n in zip(directions, grid.sides, grid.points, strict=True)
@@ -156,7 +156,35 @@ def _draw(
     magnitude = np.linalg.norm(B, axis=-1)
     norm, largest, is_logarithmic = _colour_norm(magnitude)
     image = axes.pcolormesh(x, y, masked(magnitude), norm=norm, cmap="viridis", shading="nearest")
-    in_plane = [B @ e for e in directions]
+    _draw_field_lines(axes, x, y, [B @ e for e in directions], largest)
+    lines = section(surface, grid)
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
+    axes.set(xlabel=_direction(directions[0], R), ylabel=_direction(directions[1], R))
+    place = _place(grid, directions, length_of_R, R)
+    axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{place}")
+    bar = axes.figure.colorbar(
+        image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05
+    )
+    if not is_logarithmic:
+        bar.ax.xaxis.set_major_formatter(number_format())
+    plane_lines = length_of_R * np.stack([lines @ e for e in directions], axis=-1)
+    _draw_section(axes, plane_lines, length_of_R * h, is_body=surface.is_body)
+
+
+def _draw_field_lines(
+    axes: "Axes", x: Array, y: Array, in_plane: Sequence[Array], largest: float
+) -> None:
+    """Draw the lines of a field in axes, unless the field is normal to the plane.
+
+    Parameters
+    ----------
+    x, y
+        (nx,) and (ny,) coordinates of the points in the axes.
+    in_plane
+        Components (ny, nx) of B along x and along y.
+    largest
+        Largest |B| at any point.
+    """
     largest_in_plane = max(
         float(np.nanmax(np.abs(component), initial=0.0)) for component in in_plane
     )
@@ -172,35 +200,41 @@ def _draw(
             density=LINE_DENSITY,
             arrowsize=0.6,
         )
-    lines = section(surface, grid)
-    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
-    axes.set(xlabel=_direction(directions[0], R), ylabel=_direction(directions[1], R))
-    place = _place(grid, directions, length_of_R, R)
-    axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{place}")
-    bar = axes.figure.colorbar(
-        image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05
-    )
-    if not is_logarithmic:
-        bar.ax.xaxis.set_major_formatter(number_format())
-    plane_lines = length_of_R * np.stack([lines @ e for e in directions], axis=-1)
-    if surface.is_body:
-        area = with_holes(outlines(plane_lines))
+
+
+def _draw_section(axes: "Axes", lines: Array, thickness: float, *, is_body: bool) -> None:
+    """Draw the section of a shell with its thickness, or of a solid, in dark grey.
+
+    Parameters
+    ----------
+    lines
+        (n, 2, 2) lines in which the plane meets the mid-surface, or the surface of the solid.
+    thickness
+        Thickness of the shell in the unit of the axes.
+    is_body
+        Whether the lines are those of a solid, which enclose its section.
+    """
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import PathPatch
+
+    if is_body:
+        area = with_holes(outlines(lines))
         axes.add_patch(PathPatch(area, color="0.15", linewidth=LINE_WIDTH))
     else:
-        rectangles = list(_thickened(plane_lines, length_of_R * h))
+        rectangles = list(_thickened(lines, thickness))
         collection = PolyCollection(rectangles, color="0.15", linewidth=LINE_WIDTH)
         axes.add_collection(collection, autolim=False)
 
 
-def _colour_norm(size: Array) -> tuple["Normalize", float, bool]:
+def _colour_norm(magnitude: Array) -> tuple["Normalize", float, bool]:
     """Return the norm of colours for |B|, the largest |B|, and whether the norm is logarithmic.
 
-    `size` is |B| (ny, nx), with nan where there is no value.
+    `magnitude` is |B| (ny, nx), with nan where there is no value.
     """
     from matplotlib.colors import LogNorm, Normalize
 
-    low = float(np.nanmin(size, initial=np.inf))
-    high = float(np.nanmax(size, initial=0.0))
+    low = float(np.nanmin(magnitude, initial=np.inf))
+    high = float(np.nanmax(magnitude, initial=0.0))
     if high <= 0:
         low, high = 0.0, 1.0
     if low * MIN_RATIO_OF_LOGARITHMS < high:  # a wide range, as near a magnet
@@ -240,7 +274,7 @@ def outlines(lines: Array) -> list[Array]:
     # of each end the two nearest ends, itself among them
     _, nearest = cKDTree(ends).query(ends, k=2)
     numbers = np.arange(len(ends))
-    # the same point as an end of another line; ends 2 i and 2 i + 1 belong to line i
+    # of each end the end of another line at the same point; ends 2 i and 2 i + 1 belong to line i
     twin = np.where(nearest[:, 0] == numbers, nearest[:, 1], nearest[:, 0])
     remaining, polygons = set(range(len(lines))), list[Array]()
     while remaining:  # a polygon in each turn
@@ -248,7 +282,8 @@ def outlines(lines: Array) -> list[Array]:
         end = 2 * line + 1
         while True:
             polygon.append(ends[end])
-            # go on along the line that begins where this one ends, until it is used already
+            # go on along the line that begins at this end; if that is in a polygon already, this
+            # polygon is closed
             next_end = int(twin[end])
             if next_end // 2 not in remaining:
                 break

@@ -1,9 +1,10 @@
 """Layout of figures: panels with images of shells, outlines, arrows and colour bars, in inches.
 
-The directions of e1, e2, e3 are drawn once in a figure. A window is the part of the camera's
-projection that an image shows, over the reference length R. A pen is a grey and a style of dashes.
-Room for text is counted in lines, `line_height`, and in points, 1/72 inch; numbers that multiply it
-are chosen by eye.
+A figure has cells of one size in rows, each with the image of a panel in the middle, the names of
+arrows above it and its colour bar below. The directions of e1, e2, e3 are drawn once in a figure. A
+window is the part of the camera's projection that an image shows, over the reference length R. A
+pen is a grey and a style of dashes. Room for text is counted in lines, `line_height`; numbers that
+multiply it are chosen by eye. The size of a font is in points, 1/72 inch.
 """
 
 import io
@@ -91,7 +92,7 @@ class Panel:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Box (left, right, low, high) over R around the window and arrows that leave it."""
+        """Box (left, right, low, high) over R around the window and all arrows, with a margin."""
         left, right, low, high = self.window.box
         if not any(len(arrows.feet) for arrows in self.arrows):
             return self.window.box
@@ -160,70 +161,135 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     """
     from matplotlib.figure import Figure
 
-    per_row, line_height = columns(len(panels)), LINE_HEIGHT * style.font_size
+    per_row = columns(len(panels))
     row_count = -(-len(panels) // per_row)  # rounded up
-    gap, dpi = GAP / INCH, style.dpi
-    heights, widths = zip(*(panel.size for panel in panels), strict=True)
-    image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
-    has_bar = any(panel.scale.colours for panel in panels)
-    # below an image: its bar with numbers and caption; above it: a line for each field of arrows
-    height_below = (4.2 if has_bar else 0.4) * line_height
-    legend_lines = max(
-        (sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0
-    )
-    height_above = gap / 2 + legend_lines * line_height
-    cell_height = image_height + height_below + height_above
+    cell = _CellSizes.around(panels, style)
+    line_height, gap, dpi = cell.line_height, GAP / INCH, style.dpi
 
-    # the directions are beside the first bar, else in a free panel or at the foot
+    # the directions are beside the first bar, else in a free cell or at the foot
+    has_bar = any(panel.scale.colours for panel in panels)
     beside_bar = has_bar and per_row < 3
-    free_panels = 0 if beside_bar else len(panels) % per_row
-    at_foot = not beside_bar and not free_panels
-    indent = gap / 2 + (4.0 * line_height if at_foot else 0.0)
-    note_lines = _wrapped(note, cell_width * per_row - indent - gap / 2, style.font_size)
+    cells_in_last_row = 0 if beside_bar else len(panels) % per_row  # 0 too if no cell is free there
+    at_foot = not beside_bar and not cells_in_last_row
+    indent = gap / 2 + (4.0 * line_height if at_foot else 0.0)  # of the note
+    note_lines = _wrapped(note, cell.width * per_row - indent - gap / 2, style.font_size)
     foot_height = max(len(note_lines) * line_height, 3.2 * line_height if at_foot else 0.0)
-    height = row_count * cell_height + foot_height
-    figure = Figure(figsize=(cell_width * per_row, height), dpi=dpi)
+    height = row_count * cell.height + foot_height
+    figure = Figure(figsize=(cell.width * per_row, height), dpi=dpi)
     boxes = FigureBoxes(figure)
     for i, panel in enumerate(panels):
-        left, lower = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
+        left, lower = i % per_row * cell.width, height - (i // per_row + 1) * cell.height
         panel_height, width = (pixels / dpi for pixels in panel.size)
-        panel_left = left + (cell_width - width) / 2
-        panel_low = lower + height_below + (image_height - panel_height) / 2
+        panel_left = left + (cell.width - width) / 2
+        panel_low = lower + cell.height_below + (cell.image_height - panel_height) / 2
         draw_panel(boxes.axes(panel_left, panel_low, width, panel_height), panel, style)
-        for k, arrows in enumerate(panel.arrows):
-            y = (
-                lower
-                + height_below
-                + image_height
-                + height_above
-                - gap / 2
-                - (k + 0.5) * line_height
-            )
-            text_place = boxes.place(left + gap / 2, y)
-            figure.text(*text_place, arrows.name, color=arrows.colour, va="center")
+        _draw_names_of_arrows(boxes, panel, cell, left, lower)
         if panel.scale.colours:
-            room_at_left = (
-                4.4 if beside_bar else 2.2
-            ) * line_height  # a power of ten needs the other side
-            bar_length = max(cell_width - gap - room_at_left - 3.2 * line_height, 3 * line_height)
-            bar_axes = boxes.axes(
-                left + gap / 2 + room_at_left,
-                lower + 1.7 * line_height,
-                bar_length,
-                0.65 * line_height,
-            )
-            caption_room = bar_length + (0.8 if beside_bar else 2 * 2.2) * line_height
-            colour_bar(figure, bar_axes, panel.scale, room=caption_room)
-    directions_size, lower = 3.4 * line_height, height - cell_height if beside_bar else foot_height
+            _draw_bar(boxes, panel.scale, cell, left, lower, with_directions=beside_bar)
+    directions_size, lower = 3.4 * line_height, height - cell.height if beside_bar else foot_height
     lower += -3.3 * line_height if at_foot else 0.4 * line_height
     directions_axes = boxes.axes(
-        free_panels * cell_width + gap / 2, lower, directions_size, directions_size
+        cells_in_last_row * cell.width + gap / 2, lower, directions_size, directions_size
     )
     directions(directions_axes, panels[0].camera, style)
     for k, text in enumerate(reversed(note_lines)):
         text_place = boxes.place(indent, (k + 0.5) * line_height)
         figure.text(*text_place, text, va="center", fontsize=0.9 * style.font_size)
     return figure
+
+
+@dataclass(frozen=True)
+class _CellSizes:
+    """Sizes of the cells of a figure, in inches; each cell has one panel.
+
+    Attributes
+    ----------
+    line_height
+        Height of a line of text.
+    width
+        Width of a cell.
+    image_height
+        Height of the tallest image.
+    height_below
+        Height below an image, of the bar with its numbers and its caption.
+    height_above
+        Height above an image, of a line for each field of arrows.
+    """
+
+    line_height: float
+    width: float
+    image_height: float
+    height_below: float
+    height_above: float
+
+    @classmethod
+    def around(cls, panels: Sequence[Panel], style: OutputSection) -> "_CellSizes":
+        """Return the sizes of cells in which each of some panels has room."""
+        line_height = LINE_HEIGHT * style.font_size
+        gap, dpi = GAP / INCH, style.dpi
+        heights, widths = zip(*(panel.size for panel in panels), strict=True)
+        image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
+        has_bar = any(panel.scale.colours for panel in panels)
+        height_below = (4.2 if has_bar else 0.4) * line_height
+        legend_lines = max(
+            (sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0
+        )
+        height_above = gap / 2 + legend_lines * line_height
+        return cls(line_height, cell_width, image_height, height_below, height_above)
+
+    @property
+    def height(self) -> float:
+        """Height of a cell."""
+        return self.image_height + self.height_below + self.height_above
+
+
+def _draw_names_of_arrows(
+    boxes: "FigureBoxes", panel: Panel, cell: _CellSizes, left: float, lower: float
+) -> None:
+    """Draw the names of a panel's arrows above its image, in their colours.
+
+    `left` and `lower` are the lower left corner of the panel's cell.
+    """
+    for k, arrows in enumerate(panel.arrows):
+        y = (
+            lower
+            + cell.height_below
+            + cell.image_height
+            + cell.height_above
+            - GAP / INCH / 2
+            - (k + 0.5) * cell.line_height
+        )
+        text_place = boxes.place(left + GAP / INCH / 2, y)
+        boxes.figure.text(*text_place, arrows.name, color=arrows.colour, va="center")
+
+
+def _draw_bar(
+    boxes: "FigureBoxes",
+    scale: Scale,
+    cell: _CellSizes,
+    left: float,
+    lower: float,
+    *,
+    with_directions: bool,
+) -> None:
+    """Draw a colour bar below the image of a cell.
+
+    Parameters
+    ----------
+    left, lower
+        Lower left corner of the cell.
+    with_directions
+        Whether the directions are to the left of the first bar, so that all bars leave room there.
+    """
+    gap, line_height = GAP / INCH, cell.line_height
+    # at the right there is room for a power of ten
+    room_at_left = (4.4 if with_directions else 2.2) * line_height
+    bar_length = max(cell.width - gap - room_at_left - 3.2 * line_height, 3 * line_height)
+    bar_axes = boxes.axes(
+        left + gap / 2 + room_at_left, lower + 1.7 * line_height, bar_length, 0.65 * line_height
+    )
+    caption_room = bar_length + (0.8 if with_directions else 2 * 2.2) * line_height
+    colour_bar(boxes.figure, bar_axes, scale, room=caption_room)
 
 
 @dataclass(frozen=True)
@@ -325,24 +391,13 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
     for is_selected, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
         points = is_point & is_selected
         if points.any():
-            axes.scatter(
-                x[points],
-                y[points],
-                s=marker_area,
-                facecolors="white",
-                edgecolors=arrows.colour,
-                linewidths=0.8,
-                zorder=5,
-            )
-            axes.scatter(
-                x[points],
-                y[points],
-                s=marker_area / 3,
-                color=arrows.colour,
-                marker=marker,
-                linewidths=0.8,
-                zorder=6,
-            )
+            _draw_circles(axes, x[points], y[points], marker_area, arrows.colour, marker)
+
+
+def _draw_circles(axes: "Axes", x: Array, y: Array, area: float, colour: str, marker: str) -> None:
+    """Draw white circles at places (n,) with a marker in each; `area` is theirs in points²."""
+    axes.scatter(x, y, s=area, facecolors="white", edgecolors=colour, linewidths=0.8, zorder=5)
+    axes.scatter(x, y, s=area / 3, color=colour, marker=marker, linewidths=0.8, zorder=6)
 
 
 def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
@@ -365,10 +420,9 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
             x, y, length = -0.35, -0.35, 0.5  # the letter is beside the dot
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
-        letters.append(_letter_place(np.array([x, y]), length, letters))
-        axes.text(
-            float(letters[-1][0]), float(letters[-1][1]), f"$e_{number}$", ha="center", va="center"
-        )
+        place = _letter_place(np.array([x, y]), length, letters)
+        letters.append(place)
+        axes.text(float(place[0]), float(place[1]), f"$e_{number}$", ha="center", va="center")
 
 
 def _letter_place(end: Array, size: float, others: Sequence[Array]) -> Array:

@@ -1,10 +1,12 @@
 """Curves of a run as data, for pictures and the report: steps, lines, smooth curves.
 
 A row is a line of path.csv: one point of the path, by column. Its label is "fold" or "bifurcation"
-at an instability (a located row), "solution" for what a search found, "field" in the step that
-applies the magnetic field; its branch is 0 on the main path. An amplitude is a load parameter, by
-name; it is one coordinate of a curve, a displacement the other. A pivot count is the number of
-unstable directions. A motion is a step in time.
+at an instability (a located row, `LOCATED`), "solution" for what a search found, "field" in the
+step that applies the magnetic field; its branch is 0 on the main path. The column `mode` names the
+mode of an instability; `OWN_MODES` are those with the symmetry of the model, others are modes that
+the model excludes. An amplitude is a load parameter, by name; it is one coordinate of a curve, a
+displacement the other. A pivot count is the number of unstable directions. A motion is a step in
+time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -104,7 +106,8 @@ def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
     x, y = axes_of(step.amplitude, step.rows[0])
     if step.amplitude != "load":
         return x, y
-    # moments have no conjugate displacement: w_over_h is then that of the pole
+    # loads that are moments have no conjugate displacement. The column w_over_h then has that of
+    # the pole, and the axis is named accordingly
     if all(row["w_over_h"] == row["w_pole_over_h"] for row in step.rows):
         x = shown_quantity("w_pole_over_h", step.rows[0])
     return x, y
@@ -183,9 +186,10 @@ class Line:
                 are_unstable.append(is_unstable(not_located[0]))
                 continue
             first_count, last_count = _unstable_count(first_row), _unstable_count(last_row)
-            # between the two rows: as many as at each of them, or one more
+            # at each of both rows the neutral direction is not counted: the segment has as many
+            # unstable directions as a row, or one more
             possible_counts = {first_count, first_count + 1} & {last_count, last_count + 1}
-            # if no direction need be unstable: stable after an unstable segment, else unstable
+            # if zero is possible, the segment is stable after an unstable one, and else unstable
             follows_unstable = bool(are_unstable) and are_unstable[-1]
             are_unstable.append(min(possible_counts, default=0) > 0 or not follows_unstable)
         return are_unstable
@@ -194,6 +198,7 @@ class Line:
     def segments(self) -> list[tuple[int, int, bool]]:
         """(first row, last row, is unstable) of each stable or unstable part of the line."""
         segments_of_line = []
+        # intervals between rows, with their numbers, in groups that are all stable or all unstable
         for unstable, group in groupby(enumerate(self.unstable), key=lambda item: item[1]):
             numbers = [i for i, _ in group]
             segments_of_line.append((numbers[0], numbers[-1] + 1, unstable))
@@ -223,8 +228,10 @@ class Line:
         """
         if self.in_time:
             return spline_curve(x, y, [float(row["time"]) for row in self.rows])
+        # at an end that is a fold the amplitude has its extreme
         level = [] if load_axis is None else [(load_axis, end) for end in self.level]
-        return smooth(x, y, [row["label"] in LOCATED for row in self.rows], level)
+        located = [row["label"] in LOCATED for row in self.rows]
+        return smooth(x, y, located=located, level=level)
 
 
 def line_coordinates(step: CurveStep) -> list[Line]:
@@ -242,18 +249,20 @@ def line_coordinates(step: CurveStep) -> list[Line]:
 def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
     """Return the rows of a branch along its curve.
 
-    They are the points of the model, and a symmetry-breaking instability after the last one.
+    They are the points of the model itself, and after the last one perhaps an instability by a mode
+    that the model excludes, if the path ends there.
     """
     # the other rows are instabilities by modes that the model excludes, found between its points
     rows_of_model = [row for row in rows if row["mode"] in OWN_MODES]
     last_place = curve_coordinates(rows_of_model[-1], amplitude)
     previous_place = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
+    # the last row of the branch, if it is such an instability; else no row
     at_end = [row for row in rows[-1:] if row not in rows_of_model and row["label"] in LOCATED]
     direction = np.subtract(last_place, previous_place)
     rows_on_line = list(rows_of_model)
     for row in at_end:
         direction_to_row = np.subtract(curve_coordinates(row, amplitude), last_place)
-        # it lies ahead of the last point, not behind it
+        # it counts if it lies ahead of the last point, not behind it
         if np.dot(direction_to_row, direction) > 0:
             rows_on_line.append(row)
     return rows_on_line
@@ -285,10 +294,10 @@ def smooth(
         Whether each point is a fold or a bifurcation, where a coordinate that turns has its
         extreme.
     level
-        Which coordinate has its extreme at which end, 0 or -1.
+        Pairs (coordinate, end): the coordinate, 0 or 1, has its extreme at the end, 0 or -1.
     """
     xy = np.array([x, y], float)
-    scale = np.ptp(xy, axis=1)  # of a picture, in which both axes count equally
+    scale = np.ptp(xy, axis=1)  # sizes of a picture, in which both axes count equally
     if xy.shape[1] == 1:
         return xy
     # the parameter at the points, and the slopes there: derivatives by the parameter
@@ -308,18 +317,20 @@ def smooth(
 
 
 def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
-    """Return the derivatives (n,) of values at n points by a parameter t; see `smooth`.
+    """Return the derivatives (n,) of values at n points by a parameter t, for a smooth curve.
 
-    `located` tells which points are folds or bifurcations.
+    They are those of parabolas through three points, limited so that the values rise wherever those
+    at the points rise. `located` tells which points are folds or bifurcations.
     """
     h, chords = np.diff(t), np.diff(values) / np.diff(t)  # intervals, and slopes of the chords
     if len(chords) == 1:
         return np.full(2, chords[0])
     # at each inner point: the chords and the intervals before and after it
     chords_before, chords_after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
-    # the largest slope in each interval, and so at each inner point
+    # the largest slope in each interval, and so at each inner point. There is no limit in an
+    # interval within which the coordinate turns
     limits = MAX_SLOPE_RATIO * np.abs(chords)
-    limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf  # it turns between these two points
+    limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf
     max_slopes = np.minimum(limits[:-1], limits[1:])
     # slope of the parabola through three points, within the limits
     inner_slopes = np.clip(
@@ -354,11 +365,19 @@ def _end_slope(h1: float, h2: float, first: float, second: float) -> float:
 
 
 def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[float]) -> Array:
-    """Return a smooth curve by cubic splines over the time, an array as that of `smooth`.
+    """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through n points of a motion.
 
-    With four points a period, a vibration keeps its form. The point before a motion and its first
-    point have the same time and are joined by a straight line. `smooth` takes the place of splines
-    where points are too few, or where further times are equal.
+    It is a cubic spline over the time. With four points a period, a vibration keeps its form. The
+    point before a motion and its first point have the same time and are joined by a straight line.
+    `smooth` takes the place of the spline where points are too few, or where further times are
+    equal.
+
+    Parameters
+    ----------
+    x, y
+        (n,) coordinates of the points.
+    point_times
+        (n,) their times.
     """
     xy, times = np.array([x, y], float), np.array(point_times, float)
     is_later = np.concatenate([[True], np.diff(times) > 0])  # than the point before

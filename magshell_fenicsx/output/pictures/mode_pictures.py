@@ -3,10 +3,11 @@
 gradients.png shows where a result would change most with more of a field.
 
 A row is a line of path.csv: one point of the path. A null vector is the mode that is neutral at an
-instability; a point there is singular. "mode" and "mode_w" are the fields of a mode: its
-displacement and the normal component of that, see `fields.mode_fields`. A layer is the field in
-whose colours a shell is drawn. h and R are thickness and reference length. Lengths of the layout
-are in inches.
+instability; a point there is singular. Instabilities are numbered along the path. "mode" and
+"mode_w" are the fields of a mode: its displacement, of largest length one, and the inward normal
+component of that. A layer is the field in whose colours a shell is drawn. h and R are thickness and
+reference length. Lengths of the layout are in inches; `line_height` is that of a line of text, and
+numbers that multiply it are chosen by eye.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -95,7 +96,7 @@ def small_panels(
 
     count, line_height, gap = len(surfaces), LINE_HEIGHT * style.font_size, GAP / INCH
     per_row = columns(count) if count < 10 else 4
-    # lengths are in inches
+    # sizes: all panels have one window, around the undeformed and the deformed shells
     width = (style.width or (ONE_COLUMN if count == 1 else TWO_COLUMNS)) / INCH
     cell_width = width / per_row
     places = [camera(np.concatenate([surface.r0, surface.r0 + surface.u])) for surface in surfaces]
@@ -121,17 +122,28 @@ def small_panels(
             left + cell_width / 2, lower + image_height + caption_lines * line_height / 2
         )
         figure.text(*text_place, caption, ha="center", va="center")
+    _draw_bar_and_directions(boxes, panel, style, width, foot_height)  # all have one scale
+    return figure
+
+
+def _draw_bar_and_directions(
+    boxes: FigureBoxes, panel: Panel, style: OutputSection, width: float, foot_height: float
+) -> None:
+    """Draw the colour bar of a panel in the middle, and the directions of e1, e2, e3 to its left.
+
+    `width` is that of the figure, `foot_height` the height below both, in inches.
+    """
+    line_height, gap = LINE_HEIGHT * style.font_size, GAP / INCH
     bar_length = min(width - gap - 8 * line_height, 4.0)  # inches, with room for the directions
     bar_axes = boxes.axes(
         (width - bar_length) / 2, foot_height + 1.7 * line_height, bar_length, 0.65 * line_height
     )
-    colour_bar(figure, bar_axes, panel.scale, room=bar_length)
+    colour_bar(boxes.figure, bar_axes, panel.scale, room=bar_length)
     directions(
         boxes.axes(gap / 2, foot_height + 0.4 * line_height, 3.4 * line_height, 3.4 * line_height),
-        camera,
+        panel.camera,
         style,
     )
-    return figure
 
 
 def solution_rows(rows: Sequence[Row]) -> list[Row]:
@@ -143,7 +155,7 @@ def solution_rows(rows: Sequence[Row]) -> list[Row]:
     for number_of_row, row in enumerate(rows):
         if row["label"] == SOLUTION:
             previous = rows[number_of_row - 1]
-            # the first solution of its step
+            # before the first solution of its step comes the last point of the path so far
             if previous["label"] != SOLUTION or previous["step"] != row["step"]:
                 earlier_path = [
                     earlier_row
@@ -163,7 +175,7 @@ def solutions_figure(
     Parameters
     ----------
     surfaces, rows
-        Deformed shells, and their rows of path.csv, see `solution_rows`.
+        Deformed shells, and their rows of path.csv: solutions, and ends of the path before them.
     h
         Thickness over R.
     """
@@ -174,14 +186,16 @@ def solutions_figure(
         ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, caption)
         for surface in surfaces
     ]
-    # "stable" or "unstable"
-    captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
+    captions = list[str]()
+    for row in rows:
+        stable_or_unstable, *_ = stability(row).split()  # the first word
+        captions.append(f"{_name(row)}: {stable_or_unstable}")
     with drawing(style):
         return small_panels(surfaces, layers, captions, style, camera)
 
 
 def _name(row: Row) -> str:
-    """Return words for a row of `solution_rows`."""
+    """Return words for the row of a solution, or of the end of the path."""
     return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
 
 
@@ -204,7 +218,7 @@ def modes_figure(
     Parameters
     ----------
     surfaces
-        Surfaces with the fields "mode" and "mode_w"; see `fields.mode_fields`.
+        Deformed surfaces with the fields "mode" (n, 3), of largest length one, and "mode_w" (n,).
     captions
         Captions of the panels, in matplotlib's mathematics.
     max_panels
@@ -291,6 +305,7 @@ def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
     Number of the first point of each distinct instability -> all rows at which the path meets it.
     """
     occurrences: dict[int, list[Row]] = {}
+    # the displacements by which instabilities are compared, and their sizes
     columns_here = singular[0] if singular else {}
     displacements = [
         name for name in columns_here if quantity(name).kind in ("displacement", "place")
@@ -337,18 +352,20 @@ def _null_vector(
     occurrences
         Number of a point -> the rows of the same instability.
     """
-    # modes with the model's own symmetry have no label in names of files
+    # the file of the null vector; a mode with the model's own symmetry has no label in its name
     label = "" if row["mode"] in OWN_MODES else str(row["mode"])
     file = mode_file(folder, int(row["point"]), str(row["label"]), label)
     if not file.exists():
         return None
     surface, _ = read_vtu(file)
+    # in brackets: the mode's name, and the number of its waves where they can be counted
     details = [str(row["mode"])] if row["mode"] else []
     if not label and (waves := wave_number(surface)):
         details.append(f"m = {waves}")
     details = [detail.replace("m = ", "$m$ = ") for detail in details]
     kind = f" ({', '.join(details)})" if details else ""
     load_words = f"\n{_load_words(row, rows)}" if row["amplitude"] else ""
+    # the numbers of all instabilities that are the same one
     rows_of_same = occurrences[int(row["point"])]
     number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in rows_of_same)
     return surface, f"{number_words}: {row['label']}{kind}{load_words}"
@@ -409,9 +426,9 @@ def _limit(sizes: Array) -> float:
 
 
 def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
-    """Return arrows of vectors (n, 3) at nodes, at some visible nodes where vectors are long.
+    """Return arrows of vectors (n, 3) at some of the n nodes, which are visible and well separated.
 
-    The longest arrow is as long as the least distance of arrows.
+    Short vectors have no arrow. The longest arrow is as long as the least distance of arrows.
     """
     r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
     longest, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())

@@ -2,8 +2,10 @@
 
 A layer is the field in whose colours one panel of a picture is drawn. A window is the part of the
 camera's projection that a picture shows; places in the projection are over the reference length R,
-to the right, up and towards the eye. A place is visible if no part of the surface is nearer to the
-eye. Br, Ba and J are remanence, applied field and induced polarisation, h is the thickness over R.
+to the right, up and towards the eye. Its `scale` is the number of pixels for R. A place is visible
+if no part of the surface is nearer to the eye. A line with nan between places is interrupted there.
+A pen is a grey and matplotlib's name of dashes. Br, Ba and J are remanence, applied field and
+induced polarisation, h is the thickness over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -152,6 +154,10 @@ class Background:
 
     Parameters
     ----------
+    surface
+        The deformed shell with its fields, and with bodies and sources.
+    camera
+        Projection.
     width
         Width of the picture in pixels.
     window
@@ -174,13 +180,15 @@ class Background:
         the projection and its pen.
         """
         self._surface, self._camera = surface, camera
+        # the deformed shell and the bodies in the window
         tessellation, r = tessellate(surface), surface.r0 + surface.u
         self.window = window or Window.around(
             camera(np.concatenate([surface.r0, r, *near_places(surface)])), width
         )
         self.seen = RenderedSurface(tessellation, r, camera, self.window)
         self._bodies = BodiesInView(surface, camera, self.window, self.seen)
-        # for the undeformed shell half of the resolution is enough: its line is wider than a pixel
+        # outlines of the deformed and the undeformed shell. For the latter half of the resolution
+        # is enough, since its line is wider than a pixel
         coarse = replace(self.window, scale=self.window.scale / 2)
         undeformed_view = RenderedSurface(tessellation, surface.r0, camera, coarse)
         outline = silhouette(self.seen)
@@ -190,8 +198,9 @@ class Background:
         distance = MIN_OUTLINE_DISTANCE / self.window.scale
         min_length = MIN_OUTLINE_LENGTH / self.window.scale
         edges = [self._visible_part(edge_lines(surface))]
+        # of sources without faces, such as coils
         bare_lines = [self._visible_part(_divided(line)) for line in bare_outlines(surface)]
-        # the undeformed outline and edges are drawn where they differ visibly from the outline
+        # the undeformed outline, and edges, are drawn where they are apart from the outline
         undeformed = lines_away_from(undeformed_outline, outline, distance, min_length)
         self._lines = (
             *((line, UNDEFORMED) for line in undeformed),
@@ -202,7 +211,10 @@ class Background:
         )
 
     def _not_behind(self, line: Array, undeformed_view: RenderedSurface) -> Array:
-        """Return a line (n, 2) of the undeformed outline, nan where the deformed shell hides it."""
+        """Return a line (n, 2) of the undeformed outline, nan where the deformed shell hides it.
+
+        `undeformed_view` is the undeformed shell rendered alone, which gives the line's depth.
+        """
         tolerance = MIN_OUTLINE_DISTANCE / self.window.scale
         depth = undeformed_view.depth_around(line)
         is_hidden = self.seen.depth_around(line) > depth + tolerance
@@ -216,7 +228,10 @@ class Background:
         return places
 
     def panel(self, layer: ColouredField, style: OutputSection) -> Panel:
-        """Return the shell in a layer's colours, or grey with arrows if the layer has none."""
+        """Return the shell in a layer's colours, or grey with arrows if the layer has none.
+
+        The limits of colours are those of the layer, or those that `style` gives for its field.
+        """
         texts = tuple(self._bodies.poles)
         names = self._names() if layer.name in FIELDS_WITH_NAMES else ()
         if not layer.colours:
@@ -232,7 +247,8 @@ class Background:
         low, high = style.ranges.get(layer.name, layer.limits)
         colours = colour_map(layer.colours, (low, high))
         image = self.seen.coloured(layer.values, (low, high), colours)
-        slack = END_TOLERANCE * (high - low)  # rounding beyond an end is not told
+        # whether there are values beyond an end of the bar, by more than rounding
+        slack = END_TOLERANCE * (high - low)
         is_below = bool(np.nanmin(layer.values) < low - slack)
         is_above = bool(np.nanmax(layer.values) > high + slack)
         scale = Scale((low, high), layer.colours, layer.caption, (is_below, is_above))
@@ -332,7 +348,7 @@ def edge_lines(surface: Surface) -> Array:
     """
     if surface.is_body:
         return np.zeros((0, 3))
-    # d - 1 nodes are within a side: a triangle of degree d has (d + 1)(d + 2)/2 nodes
+    # a triangle of degree d has (d + 1)(d + 2)/2 nodes, d - 1 of them within each side
     nodes_within_side = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
     # in VTK's order: three corners, then the nodes within each side
     nodes_of_sides = [
@@ -340,7 +356,7 @@ def edge_lines(surface: Surface) -> Array:
         for k in range(3)
     ]
     sides = surface.cells[:, nodes_of_sides].reshape(-1, nodes_within_side + 2)
-    # places of nodes have one number, even if nodes of two shells are double there
+    # a number for each place of nodes: where two shells meet, nodes are double but have one place
     rounded = np.round(surface.r0 / SAME_PLACE_TOLERANCE) + 0.0
     _, place_numbers = np.unique(rounded, axis=0, return_inverse=True)
     # sides of two triangles have the same two ends
@@ -348,7 +364,8 @@ def edge_lines(surface: Surface) -> Array:
     _, first_side, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
     edges = sides[first_side[count == 1]]
     nodes_along_edges = (surface.r0 + surface.u)[edges]
-    # values of the shape functions at places along an edge, (places, nodes of a side)
+    # values of the shape functions at places along an edge, (places, nodes of a side): polynomials
+    # through the nodes, by matrices of powers
     positions = np.linspace(0, 1, SEGMENTS_PER_INTERVAL * (nodes_within_side + 1) + 1)
     node_positions = np.linspace(0, 1, nodes_within_side + 2)
     table = np.vander(positions, nodes_within_side + 2) @ np.linalg.inv(np.vander(node_positions))
@@ -433,7 +450,8 @@ def field_arrows(
     offsets = np.zeros(places.shape)
     if len(names) > 1:
         offsets = _foot_offsets(list(vectors.values())) * FOOT_OFFSET * extent
-    # feet of the first field go left, of the second right, a third one stays
+    # the feet of the first field are moved to the left, those of the second to the right; those of
+    # a third stay
     for name, sign in zip(names, (1, -1, 0), strict=False):
         is_long = lengths[name][feet] > MIN_ARROW * lengths[name].max()
         arrow_feet = (places + sign * offsets)[is_long]
@@ -442,14 +460,14 @@ def field_arrows(
 
 
 def _foot_offsets(fields: Sequence[Array]) -> Array:
-    """Return unit vectors (n, 3) in the picture, to the left of the first of several fields.
+    """Return unit vectors (n, 3) in the picture, to the left of the arrows of the first field.
 
-    They are zero where the last field does not cover the first.
+    They are zero where the arrow of the last field does not cover that of the first one.
 
     Parameters
     ----------
     fields
-        Projected vectors (n, 3) of each field.
+        Projected vectors (n, 3) of each field, at the same n places.
     """
     (x, y), (last_x, last_y) = fields[0][:, :2].T, fields[-1][:, :2].T
     length, last_length = np.hypot(x, y), np.hypot(last_x, last_y)

@@ -135,8 +135,12 @@ def plot(
 
     Parameters
     ----------
-    point, options, shapes
-        See `draw`. With a point the report stays as it is.
+    point
+        Draw only this point: shell_0007.png, strains_0007.png, ... The report then stays as it is.
+    options
+        Keys of the section `output` in place of those of the case.
+    shapes
+        Points whose shells are put on the curve.
     animation
         Whether to draw animation.gif too.
 
@@ -277,15 +281,17 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     `shapes` are the numbers of points whose shells are put on the curve.
     """
     style, last_row = run.style, run.on_path[-1]
-    # pictures for which the run has no data are left out
+    # pictures for which the run has no data are left out below
     surface, shell_data = run.surface_at(run.headline)
     # over the load: the curve, and what sensors read
     if amplitude := str(last_row["amplitude"]):
         curve = curve_figure(run.rows, amplitude, style, run.pole_name)
         if shapes:
             with drawing(style):
-                rows = [run.rows[number] for number in shapes]
-                shells = [(row, run.surface_at(row)[0]) for row in rows]
+                shells = list[tuple[Row, Surface]]()
+                for number in shapes:
+                    surface_of_shape, _ = run.surface_at(run.rows[number])
+                    shells.append((run.rows[number], surface_of_shape))
                 steps = worth_drawing(curve_steps(run.rows, amplitude))
                 add_shapes(curve, steps, shells, style, run.camera)
         yield from figure_files(curve, style, "curve")
@@ -307,11 +313,13 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
             figure = frequencies_figure(frequencies, run.rows, style)
         yield from figure_files(figure, style, "frequencies")
     if files := gradient_files(run.folder):
-        by_result = {result: read_vtu(file)[0] for result, file in files.items()}
+        by_result = dict[str, Surface]()
+        for result, file in files.items():
+            by_result[result], _ = read_vtu(file)
         figure = gradients_figure(by_result, style, run.camera)
         yield from figure_files(figure, style, "gradients")
     if solutions := solution_rows(run.rows)[:MAX_PANELS]:
-        surfaces = [run.surface_at(row)[0] for row in solutions]
+        surfaces, _ = zip(*(run.surface_at(row) for row in solutions), strict=True)
         figure = solutions_figure(surfaces, solutions, shell_data.h, style, run.camera)
         yield from figure_files(figure, style, "solutions")
 
@@ -332,16 +340,17 @@ def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surf
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:
     """Draw animation.gif into a run's folder, and return its name.
 
-    It shows all steps of a programme, or the part in which the last amplitude varied. After a
-    motion it shows the motion alone, at equal times. `options` are as of `draw`.
+    It shows all steps of a programme, or the part in which the last amplitude varied. If the run
+    ends with a motion, it shows motions alone, at equal times. `options` are keys of the section
+    `output` in place of those of the case.
     """
     run = PicturedRun(folder, options)
     rows = run.on_path
     amplitude = str(rows[-1]["amplitude"])
     steps = curve_steps(rows, amplitude) if amplitude else []
     shown_rows = rows if len(steps) != 1 else steps[0].rows
+    # the rows that are shown as frames: of motions those at equal times
     frame_rows = (
-        # of a motion: rows at equal times
         in_true_time(rows) if amplitude == "time" else evenly_chosen(shown_rows, MAX_FRAMES)
     )
     surfaces, data_of_frames = zip(*(run.surface_at(row) for row in frame_rows), strict=True)
@@ -357,7 +366,8 @@ def in_true_time(rows: Sequence[Row]) -> list[Row]:
     """Return the rows of a path's motions that are nearest to equal times, at most MAX_FRAMES."""
     motion = [row for row in rows if row["amplitude"] == "time"]
     times = np.array([float(row["time"]) for row in motion])
-    # frames at least as far apart as the two nearest rows; one frame if all rows have one time
+    # frames are at least as far apart as the two rows that are nearest in time; there is one frame
+    # if all rows have one time
     shortest = np.diff(np.unique(times)).min(initial=np.ptp(times) or 1.0)
     count = int(min(MAX_FRAMES, np.ptp(times) / shortest + 1.5))
     return [

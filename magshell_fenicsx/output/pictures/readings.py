@@ -34,6 +34,10 @@ def readings_figure(
 
     Parameters
     ----------
+    rows
+        Rows of path.csv.
+    amplitude
+        The amplitude that varied last.
     case
         The case of summary.json, with the names of its sensors.
     """
@@ -44,6 +48,7 @@ def readings_figure(
     size_of_unit, unit = unit_of(case)
 
     def over_load(column: str) -> PlaceOf:
+        """Return a function from a row to the load and the reading of a column there."""
         return lambda row: (load.on_axis(row), size_of_unit * float(row[column]))
 
     readings = [f"{name}_B{axis}" for name in names for axis in "xyz"]
@@ -63,6 +68,7 @@ def readings_figure(
         for axes, name in zip(grid, names, strict=False):
             for k, axis in enumerate("xyz"):
                 column = f"{name}_B{axis}"
+                # a component that is zero is left out
                 if max(abs(float(row[column])) for row in step.rows) > ZERO_READING * largest:
                     draw_lines(axes, step, f"C{k}", over_load(column))
                     # an empty line, for the legend
@@ -87,12 +93,14 @@ def unit_of(case: Mapping[str, Any]) -> tuple[float, str]:
     >>> unit_of({"magnetic": {"remanent": {"flux_density": None}, "lambda_m": 1e-4}})
     (1.0, '$B/|B^\\mathrm{r}|$')
     """
+    # the sections of all remanences, of the case and of each of several shells
     magnetic = case.get("magnetic") or {}
     shells = (case.get("shells") or {}).values()
     remanences_of_shells = [shell["remanent"] for shell in shells if shell.get("remanent")]
     remanences = [
         section for section in (magnetic.get("remanent"), *remanences_of_shells) if section
     ]
+    # B is in T where a remanence, or without one the field, is given in units
     if any(section.get("flux_density") for section in remanences):
         return MILLI, "(mT)"
     if remanences:

@@ -4,7 +4,8 @@ raster.c draws at `FINER` times the resolution of the picture. A "drawn pixel" i
 resolution. The projection has coordinates to the right, up and towards the eye (the depth), over
 the reference length R; a window is the part that a picture shows. Pixels are counted from the upper
 left corner, to the right and downwards. A tessellation divides the cells of a surface into flat
-triangles.
+triangles, whose corners are its points. A surface has colours by the values at these points, and
+light and shade by a lamp. Sources and bodies near the shell are drawn as lines and faces.
 """
 
 from dataclasses import dataclass
@@ -127,8 +128,8 @@ class RenderedSurface:
         """Draw the triangles, and keep what is in front at each drawn pixel.
 
         `_index` (height, width) is the number of the triangle in front, and `_depth` its depth
-        towards the eye. `_places` are the points of the tessellation in drawn pixels, and `_r` the
-        nodes.
+        towards the eye. `_places` are the points of the tessellation: in drawn pixels to the right
+        and downwards, and their depth over R. `_r` are the nodes.
         """
         self._tessellation, self.camera, self.window = tessellation, camera, window
         height, width = (FINER * n for n in window.shape)
@@ -148,11 +149,12 @@ class RenderedSurface:
 
     @cached_property
     def _light(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Cosines of normals with the eye and with the lamp, and the cosine of full light.
+        """Cosines (points,) of normals with the eye and with the lamp, and the one of full light.
 
-        The last one is a cosine with the lamp: a place with that cosine has the colours of the bar.
-        It is that of a surface that faces the eye. If no place has so large a cosine, it is the
-        largest one; so a plate that is turned away from the lamp still has the colours of the bar.
+        The last number is a cosine with the lamp: a place with that cosine has the same colours as
+        the bar beside the picture, neither lighter nor darker. It is that of a surface that faces
+        the eye. If no place has so large a cosine, it is the largest one of all places. So a plate
+        that is turned away from the lamp still has the colours of the bar.
         """
         normals = self.camera(self._tessellation.normals(self._r))
         lamp = np.array(LAMP) / np.linalg.norm(LAMP)
@@ -185,6 +187,7 @@ class RenderedSurface:
         """Return the largest depth (n,) at drawn pixels around places (n, 2) of the projection."""
         left, _, _, high = self.window.box
         height, width = self._depth.shape
+        # from the upper left corner, to the right and downwards
         from_corner = np.nan_to_num((places - [left, high]) * [1, -1])
         x, y = (from_corner * FINER * self.window.scale).astype(int).T
         pixels = [
@@ -205,7 +208,8 @@ class RenderedSurface:
         image = self.painted(np.where(is_absent, limits[0], values_at_points), limits, table)
         if not is_absent.any():
             return image
-        # painted white where values are absent, and black elsewhere
+        # another image, which is white where values are absent and black elsewhere, says which
+        # pixels become grey
         black_and_white = np.repeat([[0.0], [1.0]], 3, axis=1)
         absence = self.painted(is_absent * 1.0, (0.0, 1.0), black_and_white)
         is_grey = absence[..., :1] > MIN_WHITE
@@ -228,8 +232,8 @@ class RenderedSurface:
         height, width = self.window.shape
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
-        *cosines, full_light = self._light
-        # in the order of the C function's arguments, see FUNCTIONS
+        *cosines, full_light = self._light  # with the eye and with the lamp
+        # groups of arguments of the C function `paint`, in their order
         triangles = _pointers(self._places, self._tessellation.triangles, self._index)
         sizes = (width, height, FINER)
         values_and_cosines = _pointers(numbers, *cosines)
@@ -247,6 +251,7 @@ class RenderedSurface:
         x = np.floor((projected[:, 0] - left) * FINER * self.window.scale).astype(int)
         y = np.floor((high - projected[:, 1]) * FINER * self.window.scale).astype(int)
         is_inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        # depth of what is in front at each place, which hides it if it is nearer to the eye
         front = np.full(len(places), -np.inf)
         front[is_inside] = self._depth[y[is_inside], x[is_inside]]
         return np.asarray(projected[:, 2] > front - tolerance)
@@ -291,8 +296,8 @@ DEFAULT_AZIMUTH = -0.5  # rad, of other places
 def run_camera(surface: Surface, style: OutputSection) -> Camera:
     """Return the camera of all pictures of a run.
 
-    It is that of the section `output`, or sees the largest displacement of `surface`, the shell at
-    the run's headline.
+    It is that of the section `output`. Without one it is chosen so that the largest displacement of
+    `surface` is seen: the shell at the point that the run is about.
     """
     if style.camera is None:
         return _best_camera(surface, deflected_place(surface))
@@ -314,16 +319,17 @@ def _best_camera(surface: Surface, place: Array) -> Camera:
     corners = tessellation.at_points(r)[tessellation.triangles]
     places = np.concatenate([surface.r0, r, *outlines])
 
-    def size(camera: Camera) -> float:
+    def filled_fraction(camera: Camera) -> float:
         """Return the fraction of the picture that the shell's triangles fill, hidden ones too."""
         a, b, c = np.moveaxis(camera(corners)[..., :2], 1, 0)
         left, right, low, high = Window.around(camera(places), 1).box
+        # x and y of two sides of each triangle, whose cross product is twice its area
         x, y = np.moveaxis(np.stack([b - a, c - a]), -1, 0)
         area = np.abs(x[0] * y[1] - x[1] * y[0]).sum() / 2
         return float(area / ((right - left) * (high - low)))
 
-    best = max((Camera(viewing_direction(place, turn)) for turn in TURNS), key=size)
-    return best if size(best) > MIN_GAIN * size(default) else default
+    best = max((Camera(viewing_direction(place, turn)) for turn in TURNS), key=filled_fraction)
+    return best if filled_fraction(best) > MIN_GAIN * filled_fraction(default) else default
 
 
 def viewing_direction(place: Array, turn: float = -0.5) -> Array:
@@ -400,7 +406,7 @@ def _object_numbers(lines: Sequence[Array], tolerance: float) -> list[int]:
     for i, line in enumerate(lines):
         for earlier, earlier_line in enumerate(lines[:i]):
             if _end_distance(line, earlier_line) < tolerance:
-                # all lines of one number get the other number
+                # both are of one object: all lines with the number of this line get the other one's
                 numbers = [
                     numbers[earlier] if number == numbers[i] else number for number in numbers
                 ]

@@ -1,7 +1,7 @@
 """Colours and numbers: colour maps, bars with the values at their ends, numbers of axes.
 
 A field with a sign has a colour map that is white at zero, red above and blue below. Limits are the
-values at the ends of the colours.
+values at the ends of the colours. Ticks are the values that have numbers beside a bar.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
+    from matplotlib.text import Text
     from matplotlib.ticker import ScalarFormatter
 
 SIGNED = "signed"  # colour map of fields with a sign
@@ -107,17 +108,18 @@ def colour_bar(
     ----------
     axes
         Axes that become the bar.
+    scale
+        Limits, colours and caption.
     orientation
         "horizontal" or "vertical".
     room
         Inches that the caption above a horizontal bar may be wide; a longer one is written smaller.
     """
     from matplotlib import rcParams
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
-    from matplotlib.ticker import MaxNLocator
 
+    # matplotlib's names of the pointed ends
     extend = {
         (True, True): "both",
         (True, False): "min",
@@ -126,16 +128,10 @@ def colour_bar(
     }
     inches = axes.get_position().width * figure.get_figwidth()
     length = inches * 72 / rcParams["font.size"]  # in heights of a letter
-    max_intervals, end_distance = 5, END_DISTANCE
-    if orientation == "horizontal" and length < SHORT_BAR:
-        max_intervals = 3
-        end_distance = max(END_DISTANCE, END_DISTANCE_IN_LETTERS / length)
+    is_short = orientation == "horizontal" and length < SHORT_BAR
     low, high = scale.limits
-    ticks = MaxNLocator(max_intervals, steps=[1, 2, 5, 10]).tick_values(low, high)
-    inner_ticks = [
-        tick for tick in ticks if end_distance < (tick - low) / (high - low) < 1 - end_distance
-    ]
-    texts, power = numbers([low, *inner_ticks, high])
+    inner_ticks = _inner_ticks(low, high, letters=length if is_short else None)
+    texts, power = numbers([low, *inner_ticks, high])  # power is their common power of ten
     bar = figure.colorbar(
         ScalarMappable(Normalize(*scale.limits), colour_map(scale.colours, scale.limits)),
         cax=axes,
@@ -151,10 +147,37 @@ def colour_bar(
         bar.ax.text(1.07, 0.5, power, transform=bar.ax.transAxes, va="center", fontsize="small")
     title = bar.ax.set_title(scale.caption, pad=3)
     if np.isfinite(room):
-        renderer = FigureCanvasAgg(figure).get_renderer()
-        title_width = title.get_window_extent(renderer).width / figure.dpi
-        reduction = min(1.0, room / title_width)  # a short caption keeps its size
-        title.set_fontsize(float(title.get_fontsize()) * reduction)
+        _fit_into(title, room, figure)
+
+
+def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
+    """Return round values between the ends of a bar, not too near to the numbers there.
+
+    Parameters
+    ----------
+    low, high
+        Values at the ends.
+    letters
+        Length of a short bar in heights of a letter; None for a long one.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    max_intervals, end_distance = 5, END_DISTANCE
+    if letters is not None:
+        max_intervals = 3
+        end_distance = max(END_DISTANCE, END_DISTANCE_IN_LETTERS / letters)
+    ticks = MaxNLocator(max_intervals, steps=[1, 2, 5, 10]).tick_values(low, high)
+    return [tick for tick in ticks if end_distance < (tick - low) / (high - low) < 1 - end_distance]
+
+
+def _fit_into(title: "Text", room: float, figure: "Figure") -> None:
+    """Write a text of a figure smaller if it is wider than `room`, in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    title_width = title.get_window_extent(renderer).width / figure.dpi
+    reduction = min(1.0, room / title_width)  # a short caption keeps its size
+    title.set_fontsize(float(title.get_fontsize()) * reduction)
 
 
 def numbers(values: Sequence[float]) -> tuple[list[str], str]:
@@ -168,8 +191,9 @@ def numbers(values: Sequence[float]) -> tuple[list[str], str]:
     ((['−0.5', '0', '20'], ''), (['0', '1', '3.41'], '$\\times 10^{-5}$'))
     """
     largest = max(map(abs, values)) or 1.0
-    order = int(np.floor(np.log10(largest)))
+    order = int(np.floor(np.log10(largest)))  # exponent of ten of the largest number
     power = 0 if -2 <= order < 4 else order  # numbers such as 0.01 and 9999 are written plainly
+    # three digits of the largest number, and no more decimals of the others
     texts = [f"{round(v / 10.0**power, 2 - order + power):.10g}" for v in values]
     texts = [text if text.strip("-0.") else "0" for text in texts]  # also of a negative zero
     power_of_ten = rf"$\times 10^{{{power}}}$" if power else ""

@@ -2,11 +2,19 @@
 
 All data are in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
 
-A row is one point of the path, by column; its label is "fold" or "bifurcation" at an instability,
-"solution" for what a search found. The headline is the row that a run is about. A frame is a row
-whose shell the page can show. A tessellation divides curved cells into flat triangles; a part of
-its points is kept as the vertices of the page. h and R are thickness and reference length; places
-are over R. A quantity knows name, words, symbol and unit of a column.
+- A row is one point of the path, by column; its label is "fold" or "bifurcation" at an instability,
+  "solution" for what a search found.
+- The headline is the row that a run is about, such as its last point or its first instability.
+- A frame is a row whose shell the page can show.
+- A step of the curve (`CurveStep`) has the rows of one load step. It consists of lines, one for
+  each branch (`Line`), whose segments are alternately stable and unstable.
+- A tessellation divides curved cells into flat triangles; a part of its points is kept as the
+  vertices of the page.
+- Arrays are stored as integers in one block of bytes (`_Packed`); elsewhere the data have the
+  location of an array in this block: a dictionary with its first byte, size and type.
+- A quantity knows name, words, symbol and unit of a column; its `sign` is that with which an axis
+  shows the column.
+- h and R are thickness and reference length; places are over R.
 """
 
 import base64
@@ -97,12 +105,13 @@ def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
     while len(vertices) > max_vertices:
         vertices, triangles = _merge_vertices(r, tessellation.triangles, edge)
         edge *= GROWTH_OF_CUBES
-    # normals of the surface and of the flat triangles; both have any length
+    # outward vectors at the triangles, and normals of the flat triangles; both have any length
     outwards = tessellation.at_points(surface.n0)[vertices][triangles].sum(axis=1)
     corners = r[vertices][triangles]
-    two_sides = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
-    normals = np.cross(*two_sides)
-    # the mirror image of a half shell has the other orientation
+    first_side, second_side = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
+    normals = np.cross(first_side, second_side)
+    # the triangles of the mirror image of a half shell are turned around, to have their outer side
+    # up like the others
     is_inverted = np.einsum("ij,ij->i", normals, outwards) < 0
     triangles[is_inverted] = triangles[is_inverted][:, ::-1]
     return SimplifiedSurface(tessellation, vertices, triangles)
@@ -130,7 +139,7 @@ def _merge_vertices(
         (k, 3) positions in `vertices`, of the triangles whose corners remain distinct.
     """
     cubes = np.rint((r - r.min(axis=0)) / edge).astype(np.int64)
-    # the cube of each point as one value: the three numbers of a large cube have so few bits that
+    # the cube of each point as one value. If cubes are large, their three numbers are so small that
     # they fit side by side into one integer, which is fast
     if edge > EXACT_SIZE:
         key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
@@ -167,7 +176,7 @@ class InteractivePart:
     about
         JSON: rows, columns, frames, fields, limits, and where each array begins in `data`.
     data
-        Base64 of the compressed arrays, see `_Packed`.
+        Base64 of the compressed block of bytes with all arrays.
     library, script
         Plotly, compressed and in base64; the script of this package.
     """
@@ -204,16 +213,20 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
     frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
     # the shells of all frames, on the nodes of the headline's shell
-    frame_surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
-    surfaces_on_nodes = [on_nodes_of(deformed, surface) for deformed in frame_surfaces]
+    surfaces_on_nodes = list[Surface]()
+    for row in frames:
+        deformed, _ = read_point(fields, int(row["point"]))
+        surfaces_on_nodes.append(on_nodes_of(deformed, surface))
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {
         **_path(rows, last_row, pole_of(case)),
+        # numbers of the rows that are frames, and the frame with which the page opens
         "frames": [rows.index(row) for row in frames],
         "opens": frames.index(headline_row) if headline_row in frames else len(frames) - 1,
         "h": shell_data.h,
         "camera": run_camera(surface, style_of(case)).direction.tolist(),
+        # arrays are put into `arrays`; the content has their locations
         "r0": arrays.add(mesh.at_vertices(surface.r0), np.uint16),
         "triangles": arrays.raw(mesh.triangles.astype(number_type)),
         "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in surfaces_on_nodes],
@@ -236,7 +249,7 @@ def _lines(shell: Surface) -> list[Any]:
 def _solid(solid: Solid, arrays: "_Packed") -> dict[str, Any]:
     """Return a body or a magnet for the page: name, corners, faces and signs of its poles.
 
-    Corners and faces are put into `arrays`; the result says where they are.
+    Corners and faces are put into `arrays`; the result has their locations there.
     """
     poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
     triangles = arrays.raw(solid.triangles.astype(np.uint16))
@@ -313,7 +326,8 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     # all columns that an axis may show: those of the curves first, then those that vary
     quantities = _quantities(rows[0])
     axes = list[str]()  # columns of the curves' axes, those of the last step first
-    for step in reversed(steps):  # a quantity of an axis says whose displacement it is
+    for step in reversed(steps):
+        # the quantity of an axis is taken from its step, which says whose displacement it is
         quantities |= {q.name: q for q in axes_for(step)}
         axes += [q.name for q in axes_for(step)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
@@ -357,12 +371,14 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
 
     It has title, axes, numbers of its rows in `rows`, and the lines between these.
     """
-    row_of_point = {int(row["point"]): i for i, row in enumerate(rows)}
+    number_of_point = {int(row["point"]): i for i, row in enumerate(rows)}
 
     def numbers_of(rows_of_line: Sequence[Row]) -> list[int]:
-        return [row_of_point[int(row["point"])] for row in rows_of_line]
+        """Return the numbers in `rows` of the rows of a line."""
+        return [number_of_point[int(row["point"])] for row in rows_of_line]
 
-    # the page draws a line as the pictures do: stable and unstable pieces of smooth curves
+    # the page draws a line as the pictures do: stable and unstable pieces of smooth curves. `level`
+    # are the ends (0 or -1) at which the amplitude has an extreme
     varied_quantity = quantity(amplitude(part.amplitude).column)
     lines = [
         {
@@ -377,6 +393,7 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
         "title": part.title or varied_quantity.words,
         "axes": [q.name for q in axes_for(part)],
         "varied": varied_quantity.name,
+        # the column of the axis that shows the amplitude
         "load": axes_for(part)[load_axis(part.amplitude)].name,
         "rows": numbers_of(part.rows),
         "lines": lines,
@@ -396,9 +413,10 @@ def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]
     earlier_steps = []
     for step_amplitude in names:
         rows_of_step = [row for row in earlier_rows if row["amplitude"] == step_amplitude]
-        first_number = max(rows.index(rows_of_step[0]) - 1, 0)
-        if rows[first_number] is not rows_of_step[0]:
-            rows_of_step = [rows[first_number], *rows_of_step]
+        # a step begins at the row before it, unless it is the first of all
+        row_before = rows[max(rows.index(rows_of_step[0]) - 1, 0)]
+        if row_before is not rows_of_step[0]:
+            rows_of_step = [row_before, *rows_of_step]
         earlier_steps.append(CurveStep(step_amplitude, rows_of_step))
     return [part for part in (*earlier_steps, *drawn_steps) if len(part.rows) > 1]
 
@@ -406,7 +424,14 @@ def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]
 def label(of_axis: Quantity, row: Row, pole: str) -> str:
     """Return the label of an axis as HTML, with the words of curve.png.
 
-    `row` names the case's points and units; `pole` names the point of w_pole_over_h otherwise.
+    Parameters
+    ----------
+    of_axis
+        Quantity of the axis.
+    row
+        A row of path.csv, whose columns name the case's points and units.
+    pole
+        Words for the point of w_pole_over_h in a case without named points.
     """
     at_point = with_point_name(of_axis, row, pole)
     words = f"{at_point.words} {at_point.note}".strip()
@@ -468,10 +493,10 @@ def _fields(
 def _colour_scale(
     name: str, nodal_values: Sequence[Array]
 ) -> tuple[float, float, list[tuple[float, str]]]:
-    """Return the limits of a field over all frames, and its colours, see `_stops`.
+    """Return the lower and the upper limit of a field over all frames, and its colours.
 
-    `nodal_values` are the field's values at each frame. Without colours the page takes Plotly's own
-    colour map.
+    `nodal_values` are the field's values at each frame. Colours are pairs of a fraction of the
+    limits' range and a colour. Without pairs the page takes Plotly's own colour map.
     """
     low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
     high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
@@ -493,7 +518,8 @@ def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[f
     from matplotlib.colors import to_hex
 
     colours = colour_map(name, limits)
-    # the last colour begins just before the end: in a map of distances it is another one, grey
+    # the last colour begins just before the end. In a map of distances it is grey, unlike the one
+    # before it
     fractions = [
         *(float(fraction) for fraction in np.linspace(0.0, 1.0, COLOUR_STOPS)[:-1]),
         1 - 1e-3,
@@ -534,7 +560,7 @@ class _Packed:
 
         Returns
         -------
-        Where the integers are, see `raw`, with `low` and `step`.
+        The location of the integers, with the keys of `raw`, and `low` and `step`.
         """
         min_integer, max_integer = np.iinfo(kind).min, np.iinfo(kind).max
         low, high = float(values.min()), float(values.max())
@@ -544,7 +570,7 @@ class _Packed:
         return {**self.raw(np.rint((values - low) / step).astype(kind)), "low": low, "step": step}
 
     def raw(self, values: NDArray[Any]) -> dict[str, Any]:
-        """Add an array unchanged.
+        """Add an array unchanged, and return its location.
 
         Returns
         -------

@@ -1,9 +1,10 @@
 """report.html: a run in one file, made from the files of its folder.
 
-Input: summary.json, path.csv, pictures and fields. A line is a row of path.csv as text: one point
-of the path. Markup is text that is HTML already, so that the template does not escape it. The pole
-is the point whose displacement the column w_pole_over_h has. A quantity knows name, symbol and unit
-of a column; the shown one is in the case's units if path.csv has such a column.
+Input: summary.json (`Summary`, a mapping), path.csv, pictures and fields. A line is a row of
+path.csv as text: one point of the path. Markup is text that is HTML already, so that the template
+does not escape it. `number` writes a number as HTML. The pole is the point whose displacement the
+column w_pole_over_h has. p_c is the classical buckling pressure of a sphere. A quantity knows name,
+symbol and unit of a column; the shown one is in the case's units if path.csv has such a column.
 """
 
 import base64
@@ -131,7 +132,10 @@ def report(folder: Path, *, playable: bool = True) -> str:
 
 
 def _content(folder: Path, playable: bool) -> dict[str, Any]:
-    """Return name -> value of all variables of the report's template."""
+    """Return name -> value of all variables of the report's template.
+
+    `playable` is whether the report has the interactive part.
+    """
     summary, lines = read_run(folder)
     case = summary["case"]
     pole = pole_of(case)
@@ -192,6 +196,7 @@ def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
     """
     groups, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")  # a number, or a formula
+    # what lambda_m is made of: for soft material alone there is no remanence in it
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
     if chi is not None and "remanent" not in magnetic:
         field = "|B<sup>a</sup>|/√(μ<sub>0</sub>E)"
@@ -226,7 +231,7 @@ def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup,
         "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
         "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),
     }
-    in_si = dimensions["units"] == "SI"
+    in_si = dimensions["units"] == "SI"  # other units have no name; flux densities are in T anyway
     return [
         (Markup(name), number(v), unit if in_si or unit == "T" else "")
         for name, (v, unit) in values_and_units.items()
@@ -236,8 +241,11 @@ def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup,
 
 def _pictured_point(case: dict[str, Any], rows: Sequence[Row]) -> str:
     """Return words for the point at which pictures show the shell; `rows` are those of path.csv."""
-    row, path = headline(case, rows), [row for row in rows if row["label"] != SOLUTION]
-    return "the last point" if row is path[-1] else f"point {row['point']}, the first instability"
+    path = [row for row in rows if row["label"] != SOLUTION]
+    pictured_row = headline(case, rows)  # the last row of the path, or the first instability
+    if pictured_row is path[-1]:
+        return "the last point"
+    return f"point {pictured_row['point']}, the first instability"
 
 
 def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tuple[str, str, bool]]:
@@ -268,7 +276,8 @@ def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tup
 def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
     """Return column -> cell of a row of the table of instabilities.
 
-    `lines` are all rows of path.csv; they show which displacements are as small as rounding.
+    `line` is the row of the instability. `lines` are all rows of path.csv; they show which
+    displacements are as small as rounding.
     """
     return {
         "point": line["point"],
@@ -314,8 +323,10 @@ def _gradients(result: str, gradient: dict[str, Any]) -> Iterator[list[Markup | 
     area of a field, and where that is.
     """
     first_cells: list[Markup | str] = [result, number(gradient["value"])]
+    # derivatives by numbers of the case
     for parameter, derivative in gradient["numbers"].items():
         yield [*first_cells, parameter, number(derivative), "–", "–"]
+    # derivatives by fields: "alike" is that by a change that is the same everywhere
     for parameter, field in gradient["fields"].items():
         components = Markup(", ").join(number(v) for v in field["alike"])
         place = ", ".join(f"{x:.3g}" for x in field["at"])
@@ -380,8 +391,7 @@ def _is_narrow(content: bytes) -> bool:
     from PIL import Image
 
     with Image.open(io.BytesIO(content)) as image:
-        # along the width; the second is the height's
-        dpi = image.info.get("dpi", (DEFAULT_DPI,))[0]
+        dpi, *_ = image.info.get("dpi", (DEFAULT_DPI,))  # along the width, then along the height
         return bool(image.width / dpi * 25.4 < MAX_COLUMN_WIDTH)  # 25.4 mm are an inch
 
 

@@ -5,8 +5,9 @@ Input: summary.json and the lines of path.csv. Output: HTML, or text for a termi
 A line is a row of path.csv as text: one point of the path. Its label is "fold" or "bifurcation" at
 an instability, its branch "0" on the main path, its amplitude the load parameter that varied. The
 pole is the point whose displacement the column w_pole_over_h has. A quantity knows name, symbol,
-words and unit of a column; the shown one is in the case's units if path.csv has such a column.
-Markup is text that is HTML already.
+words and unit of a column; the shown one (`shown_quantity`) is in the case's units if path.csv has
+such a column, and else the column itself. Markup is text that is HTML already. The summary is the
+content of summary.json; its key "in_units" has results in units, if the case has units.
 """
 
 import math
@@ -80,6 +81,8 @@ def column(
 
     Parameters
     ----------
+    values
+        Numbers of the column.
     other_columns
         Numbers of other columns with the same power of ten and the same decimals.
 
@@ -204,16 +207,15 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     names = _varying_columns(lines)
     # all energies have one power of ten, so that they can be compared
     energies = _energies(lines, [name for name in names if quantity(name).kind == "energy"])
-    table = {}
+    table = {}  # name of a column -> column of the table
     for name in names:
         # the column in units, if the path has it; otherwise the column itself
         column_quantity = shown_quantity(name, first_line)
-        all_energies = energies if column_quantity.kind == "energy" else ()
-        table[name] = _column(
+        table[name] = _table_column(
             column_quantity,
-            [line.get(column_quantity.name, "") for line in lines],
-            length_unit,
-            all_energies,
+            values=[line.get(column_quantity.name, "") for line in lines],
+            length_unit=length_unit,
+            other_columns=energies if column_quantity.kind == "energy" else (),
         )
     if at_pole := table.get("w_pole_over_h"):
         table["w_pole_over_h"] = replace(at_pole, head=pole_head(lines[0], pole))
@@ -234,9 +236,10 @@ def _varying_columns(lines: Sequence[Line]) -> list[str]:
     }
     names = [name for name in first_line if name != "point" and name not in columns_in_units]
     names_by_kind = sorted(names, key=lambda name: COLUMN_ORDER.index(quantity(name).kind))
-    varying_columns: dict[str, list[str]] = {}
+    varying_columns: dict[str, list[str]] = {}  # name -> values, as text
     for name in ("point", *names_by_kind):
         values = [line.get(name, "") for line in lines]
+        # names of displacements begin with w_; one that equals an earlier one is left out
         displacements = [
             earlier_values
             for key, earlier_values in varying_columns.items()
@@ -258,7 +261,7 @@ def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
     return [float(line[shown_quantity(name, line).name]) for line in lines for name in names]
 
 
-def _column(
+def _table_column(
     of_column: Quantity,
     values: Sequence[str],
     length_unit: str,
@@ -273,7 +276,7 @@ def _column(
     values
         Text of its cells in path.csv.
     length_unit
-        As of `path_table`.
+        Unit of the displacements of named points; empty for a case without units.
     other_columns
         Numbers of other columns that share the power of ten.
     """
@@ -290,7 +293,7 @@ def _column(
     if of_column.note:
         title = Markup("{} {}").format(title, of_column.note)
     unit = of_column.shown_unit
-    if not unit and length_unit:
+    if not unit and length_unit:  # a quantity without a unit of its own has that of its kind
         unit = UNIT_OF_KIND.get(of_column.kind, "")
     return TableColumn(title, Markup("{} {}").format(power_of_ten, unit), cells)
 
@@ -328,10 +331,11 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     tells_end = not first_instability or until in ("target", "points")
     sentences = [_end(summary, lines)] if tells_end else []
     if first_instability:
-        # one entry for each instability, in their order; a summary without them has one empty entry
-        points = summary.get("limit_points") or [{}]
-        point = points[min(located(lines).index(first_instability), len(points) - 1)]
-        sentences.append(_instability(first_instability, summary, lines, point.get("mode_at")))
+        # an entry for each instability, in their order; in place of missing ones an empty entry
+        entries = summary.get("limit_points") or [{}]
+        entry = entries[min(located(lines).index(first_instability), len(entries) - 1)]
+        mode_at = entry.get("mode_at")  # the place at which the mode is largest
+        sentences.append(_instability(first_instability, summary, lines, mode_at))
     if solutions := summary.get("solutions"):
         stable = sum(solution["stable"] for solution in solutions)
         noun = "further solution" + "s" * (len(solutions) != 1)
@@ -365,8 +369,9 @@ def _snaps(summary: Summary) -> list[Markup]:
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
         return []
-    in_ms = "snap_jump_ms" in summary
-    times = list[Markup]()  # in ms if the snap has a time in units
+    in_ms = "snap_jump_ms" in summary  # times in ms are there if the case has units
+    # the time from 10 to 90 % of the way, and that of the departure
+    times = list[Markup]()
     for key in ("jump", "departure"):
         if in_ms:
             times.append(Markup("{} ms").format(number(summary[f"snap_{key}_ms"], digits=4)))
@@ -393,11 +398,11 @@ def _error(summary: Summary) -> list[Markup]:
     tolerance = summary.get("tolerance") or {}
     if (estimate := tolerance.get("error_estimate")) is None:
         return []
-    best = tolerance.get("best")
-    # the mesh of the run need not have the smallest estimate of all rounds
+    best = tolerance.get("best")  # the round of meshes with the smallest estimate
     sentence = Markup("The estimated relative error of the result is {}").format(
         number(estimate, digits=2)
     )
+    # `best` is the round with the smallest estimate
     if best and best["error_estimate"] < estimate:
         sentence += Markup("; another mesh gives {} with {}").format(
             number(best["result"], digits=9), number(best["error_estimate"], digits=2)
@@ -424,14 +429,14 @@ def value(line: Line, summary: Summary) -> Markup:
     on a flat shell, for which p_c means nothing.
     """
     name = amplitude(line["amplitude"]).column
-    degrees = "°" if line["amplitude"] == "angle" else ""
+    degree_sign = "°" if line["amplitude"] == "angle" else ""
     shown_column = shown_quantity(name, line)  # in units, or the column itself
     has_unit = shown_column.name != name
+    # whether the column in units has the same symbol and the same number
     is_same_number = float(line[shown_column.name]) == float(line[name])
-    # the column in units has the same symbol and the same numbers
-    in_that_unit = shown_column.symbol == quantity(name).symbol and is_same_number
+    is_same_in_units = shown_column.symbol == quantity(name).symbol and is_same_number
     is_flat_pressure = name == "p_over_pc" and is_flat(summary["case"])
-    if has_unit and (in_that_unit or is_flat_pressure):
+    if has_unit and (is_same_in_units or is_flat_pressure):
         return Markup("{} = {} {}").format(
             head(shown_column), number(float(line[shown_column.name])), shown_column.si
         )
@@ -440,7 +445,9 @@ def value(line: Line, summary: Summary) -> Markup:
         measured = Markup(" ({} {})").format(
             number(float(line[shown_column.name])), shown_column.si
         )
-    return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
+    return Markup("{} = {}{}{}").format(
+        symbol(name), number(float(line[name])), degree_sign, measured
+    )
 
 
 def terminal_text(sentence: Markup) -> str:
@@ -457,7 +464,8 @@ def terminal_text(sentence: Markup) -> str:
 
 def sentence_of(folder: Path) -> str:
     """Return the result of the run in a folder as plain text for a terminal."""
-    return terminal_text(verdict(*read_run(folder)))
+    summary, lines = read_run(folder)
+    return terminal_text(verdict(summary, lines))
 
 
 def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
@@ -516,15 +524,16 @@ def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:
     dimensions = summary["dimensions"]
     in_metres = bool(dimensions["radius"]) and dimensions["units"] == "SI"
     geometry = shell_of(summary["case"])["geometry"]
-    # one pair of unit and numbers
-    ((key, numbers),) = place_in_units(place, geometry, in_metres=in_metres).items()
-    if key == "degrees" and numbers[0] < NEAR_POLE:
-        return Markup("; its mode is largest near the pole")
-    if key == "degrees":
-        position = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
+    # one pair of unit and numbers: angles on a sphere, else coordinates
+    ((unit, numbers),) = place_in_units(place, geometry, in_metres=in_metres).items()
+    if unit == "degrees":
+        polar, azimuth = numbers
+        if polar < NEAR_POLE:
+            return Markup("; its mode is largest near the pole")
+        position = f"polar {polar:.0f}°, azimuth {round(azimuth)}°"
     else:
         coordinates = ", ".join(f"{x:.3g}" for x in numbers)
-        position = f"({coordinates}) {key}" if key else f"({coordinates})"
+        position = f"({coordinates}) {unit}" if unit else f"({coordinates})"
     return Markup("; its mode is largest at {}").format(position)
 
 
@@ -599,8 +608,9 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     """
     varied_amplitude = amplitude(line["amplitude"])
     at_pole = Markup("{} at {}").format(
-        _amount(shown_quantity("w_pole_over_h", line), line, lines), pole
+        _named_amount(shown_quantity("w_pole_over_h", line), line, lines), pole
     )
+    # those axes of the curve that show a force
     force_axes = [
         axis
         for axis in axes_of(line["amplitude"], line)
@@ -608,12 +618,12 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     ]
     # the load has been said already; if a displacement is prescribed, the force is of interest
     if force_axes and varied_amplitude.column != "force":
-        return Markup("{}, {}").format(_amount(force_axes[0], line, lines), at_pole)
-    # at the load, if that is not at the pole
+        return Markup("{}, {}").format(_named_amount(force_axes[0], line, lines), at_pole)
+    # the displacement at the load is of interest, if the load is not at the pole
     is_at_load = varied_amplitude.conjugate == "w_over_h"
     if is_at_load and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} {}").format(
-            _amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
+            _named_amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
         )
     return at_pole
 
@@ -628,8 +638,11 @@ def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
     )
 
 
-def _amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
-    """Return symbol, value and unit of a column at a point, such as "w/h = 0.5"."""
+def _named_amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
+    """Return symbol, value and unit of a column at a point, such as "w/h = 0.5".
+
+    The value is zero where it is as small as rounding over the largest one in all `lines`.
+    """
     cell = amount(of_column.name, line, lines)
     unit = f" {of_column.shown_unit}" if of_column.shown_unit else ""
     return Markup("{} = {}{}").format(head(of_column), cell, unit)

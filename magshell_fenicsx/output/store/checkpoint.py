@@ -1,11 +1,16 @@
 """DIR/checkpoint: the case, then every result and finding of a run, each on disk before the next.
 
-A result is a point of a path, or the reason of a failed solve. A finding is an expensive value
-computed at a point, see `RecordedValues`. A resumed run replays results and findings: it reads them
-in place of computing them again. An element (a frame) of the file is a mark, a length, a checksum
-and the content: the head with the identity of the run, the places of a space's nodes, a result, or
-a finding. A document has what a run writes down about its case. A loading device adds unknowns to a
-state, which belong to no node. Vectors are u and du, the displacement and the tangent of the path.
+- A result is a point of a path, or the reason of a failed solve.
+- A finding is an expensive value computed at a point, perhaps with a vector (`RecordedValues`).
+- A resumed run replays results and findings: it reads them in place of computing them again.
+- An element (a frame) of the file is a mark, a length, a checksum and the content: the head with
+  the identity of the run, the places of a space's nodes, a result, or a finding.
+- The identity of a run is all that its results depend on: the case and its files, and the sources
+  of the program. A document has what a run writes down about its case.
+- A loading device adds unknowns to a state, which belong to no node.
+- Vectors are u and du, the displacement and the tangent of the path. Each rank has the values at
+  its own nodes.
+- `access_disk` lets rank 0 read or write, and gives the result, or raises, on all ranks.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. With ADIOS2 (2.10,
 through adios4dolfinx 0.9.3) a full disk raises on one rank in `Close`, and the other ranks wait for
@@ -102,14 +107,13 @@ class Ordering:
         (n, 3) positions in the order in use.
     size, last
         Number of this rank's values, and whether it is the last rank of the space.
+
+    `_space_comm` has the ranks over which the space is distributed. `_own_numbers` are the numbers
+    of this rank's nodes in the order in use, `_numbers_of_ranks` those of each rank.
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, places: Array | None = None) -> None:
-        """Number the nodes of all ranks; collective.
-
-        `_space_comm` has the ranks over which the space is distributed. `_own_numbers` are the
-        numbers of this rank's nodes in the order in use, `_numbers_of_ranks` those of each rank.
-        """
+        """Number the nodes of all ranks; collective."""
         self._space_comm, self._comm = V.mesh.comm, comm
         self._values_per_node = V.dofmap.index_map_bs
         own_places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
@@ -131,7 +135,19 @@ class Ordering:
     def _numbers_of(self, places: Array, own_places: Array, comm: MPI.Comm) -> NDArray[np.int64]:
         """Return the number in `places` of each node of this rank; collective.
 
-        Raises CaseError on every rank if nodes and places do not match one to one.
+        Parameters
+        ----------
+        places
+            (n, 3) positions in the order to use.
+        own_places
+            Positions of this rank's nodes.
+        comm
+            The communicator of all ranks.
+
+        Raises
+        ------
+        CaseError
+            On every rank, if nodes and places do not match one to one.
         """
         # a node is the nearest of the places; all ranks together must have each place once
         distance, number = scipy.spatial.cKDTree(places).query(own_places)
@@ -164,7 +180,7 @@ class Ordering:
         return values
 
     def scatter(self, values: Array) -> Vector:
-        """Return this rank's part of values (n, components) in the order in use."""
+        """Return this rank's part, a vector, of values (n, components) in the order in use."""
         return np.asarray(values.reshape(-1, self._values_per_node)[self._own_numbers].ravel())
 
 
@@ -234,8 +250,8 @@ def refuse_other_case(saved: dict[str, Any], document: Document, folder: Path) -
     CaseError
         With the first difference; `OtherSources` if only the sources differ.
     """
-    # a key `version` is of checkpoints of earlier versions
     identity_now, saved = _without_appearance(identity(document)), _without_appearance(saved)
+    # checkpoints of earlier versions have a key `version` in place of `sources`
     saved_sources, sources = saved.get("sources", saved.get("version")), identity_now["sources"]
     saved_case = _without_program(saved)
     if saved_case != _without_program(identity_now):
@@ -295,15 +311,14 @@ class Checkpoint:
     ----------
     replayed
         Number of results taken from the file.
+
+    `_replaying` is whether the file may have further elements; all ranks have the same. `_reading`
+    is the file as it is read, on rank 0. `_writing` is the file as it is appended to, on rank 0;
+    None before the first element is appended. `_ordering` is the order of the nodes in the file.
     """
 
     def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
-        """Open the file, and read the places of the nodes of `V`, or append them; collective.
-
-        `_replaying` is whether the file may have further elements; all ranks have the same.
-        `_reading` is the file as it is read, on rank 0. `_writing` is the file as it is appended
-        to, on rank 0; None before the first element is appended.
-        """
+        """Open the file, and read the places of the nodes of `V`, or append them; collective."""
         self._file, self._comm, self.replayed = file, comm, 0
         self._writing: AppendedFile | None = None
         self._replaying = True
@@ -345,7 +360,7 @@ class Checkpoint:
         if content is None:
             return None
         self.replayed += 1
-        return self._decoded(content)
+        return self._decoded_result(content)
 
     def _next_content(self) -> bytes | None:
         """Return the content of the next element of the file; None at its end. Collective."""
@@ -362,7 +377,7 @@ class Checkpoint:
         a part. Collective; `find` is called on every rank.
         """
         if content := self._next_content():
-            return self._read(content)
+            return self._decoded_finding(content)
         finding = find()
         # on rank 0 the parts of all ranks; none if the finding has no vector
         vectors_of_ranks = self._comm.gather(finding.vector)
@@ -374,7 +389,7 @@ class Checkpoint:
         self._append(b"\n".join([head.encode(), b"".join(vector.tobytes() for vector in vectors)]))
         return finding
 
-    def _read(self, content: bytes) -> RecordedValues:
+    def _decoded_finding(self, content: bytes) -> RecordedValues:
         """Return the finding in an element of the file, with this rank's part of its vector.
 
         The vector is None if the ranks do not have the nodes that they had when it was written.
@@ -383,7 +398,7 @@ class Checkpoint:
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" not in decoded)  # only a finding has values
-        sizes = decoded["parts"]  # numbers of values of the ranks
+        sizes = decoded["parts"]  # number of values of each rank that wrote the vector
         if len(sizes) != self._comm.size or not self._ordering.is_present:
             return RecordedValues(decoded["values"])
         parts_of_ranks = np.split(np.frombuffer(data), np.cumsum(sizes[:-1]))
@@ -417,12 +432,13 @@ class Checkpoint:
         self._append(_encoded(result, u, du, values_beyond_nodes))
 
     def check(self, known: bool) -> None:
-        """Do nothing: a checkpoint takes every point."""
+        """Do nothing: a checkpoint takes every point, whether `known` or not."""
 
     def close(self) -> None:
         """Close the file. Collective."""
 
         def close_files() -> None:
+            """Close the file as it is read, and as it is appended to; on rank 0."""
             self._reading.close()
             if self._writing:
                 self._writing.close()
@@ -437,23 +453,27 @@ class Checkpoint:
         """Append an element with `content` to the file, on rank 0. Collective."""
 
         def write() -> None:
-            if self._writing is None:  # cut off an incomplete last entry
+            """Append the element; at the first one cut off an incomplete last element."""
+            if self._writing is None:
                 self._writing = AppendedFile(self._file, self._reading.tell())
             self._writing.append(framed(content))
 
         access_disk(self._comm, write)
 
-    def _decoded(self, content: bytes) -> Point | str:
+    def _decoded_result(self, content: bytes) -> Point | str:
         """Return the result in an element of the file, with this rank's part of its vectors."""
+        # a line of JSON, then the values of both vectors
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
-        self._refuse_other_kind(is_other="values" in decoded)  # as a finding has
+        self._refuse_other_kind(is_other="values" in decoded)  # only a finding has values
         if "failure" in decoded:
             return str(decoded["failure"])
         vectors = np.split(np.frombuffer(data), 2)  # u and du, at all nodes
         u, du = (self._ordering.scatter(vector) for vector in vectors)
+        # values of u and of du that belong to no node, but to a loading device: the last rank has
+        # them after its nodes
         values_beyond_nodes = decoded.pop("beyond")
-        if self._ordering.last:  # the numbers of a loading device
+        if self._ordering.last:
             u, du = (
                 np.concatenate([vector, further])
                 for vector, further in zip((u, du), values_beyond_nodes, strict=True)
@@ -496,5 +516,5 @@ def _difference(saved: Any, present: Any, key: str = "") -> str:
         name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
         inner_key = f"{key}.{name}".removeprefix(".").removeprefix("case.")
         return _difference(saved.get(name), present.get(name), inner_key)
-    values = ["nothing" if value is None else json.dumps(value) for value in (saved, present)]
-    return f"{key} is {values[0]} there and {values[1]} here"
+    there, here = ("nothing" if value is None else json.dumps(value) for value in (saved, present))
+    return f"{key} is {there} there and {here} here"

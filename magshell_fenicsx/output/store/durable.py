@@ -27,7 +27,15 @@ class Damaged(CaseError):
 
 
 def read_result(file: Path) -> bytes:
-    """Return the content of a file of results; it raises as `open_result`."""
+    """Return the content of a file of results.
+
+    Raises
+    ------
+    Damaged
+        If it is a folder, a device or a pipe.
+    OSError
+        If it is not there, or cannot be read.
+    """
     try:
         return read_bounded(file)
     except OSError as e:
@@ -67,7 +75,9 @@ def read_object(file: Path) -> dict[str, Any]:
     Raises
     ------
     Damaged
-        If the file has no JSON object; otherwise as `open_result`.
+        If the file has no JSON object, or is a folder, a device or a pipe.
+    OSError
+        If it is not there, or cannot be read.
     """
     try:
         content = json.loads(read_result(file))
@@ -79,7 +89,13 @@ def read_object(file: Path) -> dict[str, Any]:
 
 
 def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> None:
-    """Write a JSON object; see `write_whole`."""
+    """Write a JSON object, so that at every moment the complete old or the new file exists.
+
+    Raises
+    ------
+    OSError
+        With the file's name; the old file is unchanged.
+    """
     write_whole(file, (json.dumps(content, indent=indent) + "\n").encode())
 
 
@@ -136,14 +152,13 @@ class AppendedFile:
         The file; it is created if it is not there.
     length
         Number of bytes of an existing file to keep; None keeps all.
+
+    `_length` is the number of bytes of all complete pieces, `_synced_length` that at the last sync,
+    and `_last_sync` the time of the last sync.
     """
 
     def __init__(self, file: Path, length: int | None = None) -> None:
-        """Open the file, and cut it off after `length` bytes.
-
-        `_length` is the number of bytes of all complete pieces, `_synced_length` that at the last
-        sync.
-        """
+        """Open the file, and cut it off after `length` bytes."""
         self._file = file
         self._stream = file.open("ab", buffering=0)
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
@@ -197,7 +212,7 @@ class AppendedFile:
             With the file's name.
         """
         try:
-            # without any sync the caller has not asked to wait
+            # if there was no sync at all, the caller has never asked to wait
             if self._last_sync > -math.inf and self._synced_length < self._length:
                 self._sync(self._length)
         except OSError as e:

@@ -1,7 +1,9 @@
 """The output folder: making and locking it, and access to the disk through rank 0.
 
-A foreign file is one that no run of this program is known to have written; it is never replaced.
-A collective function is called on all ranks, and raises on all of them.
+A foreign file is one that no run of this program is known to have written; it is never replaced. A
+study is many runs of one case; its folder has tables of them, and a file for each run in points/. A
+collective function is called on all ranks, and raises on all of them (`on_first_rank` lets rank 0
+alone call a function, and gives its result, or raises its error, on every rank).
 """
 
 import fcntl
@@ -71,8 +73,8 @@ def refuse_foreign(folder: Path, names: Iterable[str], new_files: str) -> None:
         With the names, if there are any.
     """
     if foreign := sorted(names):
-        # empty for a few names
-        further = f" and {len(foreign) - MAX_NAMED_FILES} more" * (len(foreign) > MAX_NAMED_FILES)
+        further_count = len(foreign) - MAX_NAMED_FILES
+        further = f" and {further_count} more" if further_count > 0 else ""
         raise CaseError(
             f"{folder}: has files that {new_files} would replace and that none is known to have "
             f"written: {', '.join(foreign[:MAX_NAMED_FILES])}{further}; "
@@ -84,6 +86,8 @@ def refuse_other_tables(
     folder: Path, names: Sequence[str], keys: Collection[str], new_files: str, case: str = ""
 ) -> None:
     """Refuse a folder for tables of many runs that has tables of another case, or foreign files.
+
+    Tables of the same case are replaced, and so are empty files.
 
     Parameters
     ----------
@@ -104,8 +108,8 @@ def refuse_other_tables(
     CaseError
         On the calling rank.
     """
-    content = _object(folder / names[0])
-    # known tables are replaced, if they are not of another case
+    content = _json_object(folder / names[0])
+    # tables that are known as results are replaced, unless they are those of another case
     if content.keys() >= set(keys):
         name = content.get("case")
         is_of_other_case = isinstance(name, str) and Path(name).stem != Path(case).stem
@@ -114,16 +118,16 @@ def refuse_other_tables(
                 f"--out {folder}: has {new_files} of {name}, which is kept; give another folder"
             )
         return
-    # unknown ones are replaced only if they are empty, or if the folder has the points of a study
+    # unknown files are replaced only if they are empty, or if the folder has the points of a study
     # that was interrupted before it wrote its tables
     has_points = any(
-        _object(file).keys() & KEYS_OF_POINTS for file in (folder / "points").glob("*.json")
+        _json_object(file).keys() & KEYS_OF_POINTS for file in (folder / "points").glob("*.json")
     )
     if not has_points:
         refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), new_files)
 
 
-def _object(file: Path) -> dict[str, Any]:
+def _json_object(file: Path) -> dict[str, Any]:
     """Return the JSON object in a file; empty if there is none or it cannot be read."""
     try:
         content = json.loads(read_bounded(file))
@@ -227,6 +231,7 @@ def access_disk(
     """
 
     def result() -> T:
+        """Return the result of the operation, with an error of the disk turned into a DiskError."""
         try:
             return operation()
         except OSError as e:

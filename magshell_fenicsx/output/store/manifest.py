@@ -1,7 +1,8 @@
 """Manifest of a folder: which files a run has written, so that another run replaces only these.
 
 The manifest is written.txt, a list of names. A run's names are all names that a run may write,
-`RUN_NAMES`; a file with such a name is foreign if no run is known to have written it.
+`RUN_NAMES`; a file with such a name is foreign if no run is known to have written it. The identity
+in a checkpoint has the case and the program's sources of the run that began it.
 """
 
 import re
@@ -69,9 +70,9 @@ def files_of_runs(folder: Path) -> set[str]:
     """Return those names of `files_with_run_names` that a run is known to have written.
 
     With a manifest they are the names listed there. Without one, as earlier versions left folders,
-    they are all names if summary.json is a run's. The files of a path count too if the checkpoint
-    is a run's, for instance after a kill; or if there is no manifest, but a path.csv. Only regular
-    files count.
+    they are all names if summary.json is a run's. Besides, the files of a path count if the
+    checkpoint is a run's, for instance after a kill; or if there is no manifest, but a path.csv.
+    Files that a killed run has left unfinished count too. Only regular files count.
     """
     regular_names = {
         name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)
@@ -88,7 +89,8 @@ def files_of_runs(folder: Path) -> set[str]:
         return regular_names
     # files of a path; the manifest's own name is in `names` if there is a manifest
     has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
-    if has_checkpoint or (NAME not in names and is_path(folder / "path.csv")):
+    has_manifest = NAME in names
+    if has_checkpoint or (not has_manifest and is_path(folder / "path.csv")):
         names |= {
             name for name in regular_names if name in FILES_OF_PATH or name.startswith("fields/")
         }
@@ -101,7 +103,10 @@ def is_replacement_unfinished(folder: Path) -> bool:
 
 
 def _is_of_run(read_content: Callable[[], dict[str, Any] | None]) -> bool:
-    """Whether a file has the case and the program of a run; `read_content` returns its content."""
+    """Whether a file has the case and the program of a run.
+
+    `read_content` returns its content, or None without a file. False if the file is damaged.
+    """
     with suppress(OSError, Damaged):
         content = read_content() or {}
         has_program = bool(content.keys() & {"sources", "versions"})

@@ -98,37 +98,39 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
-def _first_error(value: Any, kind: Any, key: str = "") -> str:
+def _first_error(value: Any, types: Any, key: str = "") -> str:
     """Return in words the first key whose value no run writes; empty if there is none.
 
-    A value is wrong if it has another type than `kind`, or lacks a key. Dictionaries and lists are
+    A value is wrong if it has another type than `types`, or lacks a key. Dictionaries and lists are
     searched entry by entry.
 
     Parameters
     ----------
     value
-        The value, or a part of summary.json.
-    kind
-        Its type, or a structure of types as in `SUMMARY_TYPES`.
+        A part of summary.json.
+    types
+        What it must be, as in `SUMMARY_TYPES`: a type, or a tuple of several; a list with the types
+        of all entries of a list; or a dictionary from keys to the types of their values.
     key
-        Key path of the value; empty for all of summary.json.
+        Key path of the value, such as ".mesh.cells"; empty for all of summary.json.
     """
-    entries: list[tuple[Any, Any, str]] = []  # (value, its kind, its key path)
-    if isinstance(kind, list) and isinstance(value, list):
-        entries = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
-    elif isinstance(kind, dict) and isinstance(value, dict):
-        types_of_keys = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
+    entries: list[tuple[Any, Any, str]] = []  # (value, its types, its key path)
+    if isinstance(types, list) and isinstance(value, list):
+        entries = [(entry, types[0], f"{key}.{i}") for i, entry in enumerate(value)]
+    elif isinstance(types, dict) and isinstance(value, dict):
+        # name, perhaps with ? -> types; * stands for all keys that are there
+        types_by_name = dict.fromkeys(value, types["*"]) if "*" in types else types
         # a name that ends with ? may be absent
-        missing = [name for name in types_of_keys if not name.endswith("?") and name not in value]
+        missing = [name for name in types_by_name if not name.endswith("?") and name not in value]
         if missing:
             return f"it has no {key}.{missing[0]}".replace(" .", " ")
-        names = {name: name.removesuffix("?") for name in types_of_keys}
+        keys_by_name = {name: name.removesuffix("?") for name in types_by_name}
         entries = [
-            (value[inner_key], types_of_keys[name], f"{key}.{inner_key}")
-            for name, inner_key in names.items()
+            (value[inner_key], types_by_name[name], f"{key}.{inner_key}")
+            for name, inner_key in keys_by_name.items()
             if inner_key in value
         ]
-    elif isinstance(kind, list | dict) or not isinstance(value, kind):
+    elif isinstance(types, list | dict) or not isinstance(value, types):
         # no list or dictionary where one is due, or a single value of another type
         return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
     errors = (_first_error(*entry) for entry in entries)
@@ -151,7 +153,9 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
     """
     output_data, options = case.get("output") or {}, options or {}
     source = Source("options", {"output": {**output_data, **options}})
-    for key in options:  # messages name the option of the command line in place of a line of a file
+    # where each key stands, for messages: an option of the command line in place of a line of a
+    # file
+    for key in options:
         source.places["output", key] = f"--{key.replace('_', '-')}"
     try:
         return _Options.model_validate(source.data).output
@@ -168,7 +172,7 @@ def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
     path = [row for row in rows if row["label"] != SOLUTION]
     loading = case.get("loading") or {}
     last_load = loading[-1] if isinstance(loading, list) else loading
-    # such a run goes on beyond the instability, so that it is about its end
+    # a run that goes on beyond the instability is about its end
     goes_on = last_load.get("then") or last_load.get("branches")
     ends_at_limit = last_load.get("until") == "limit" and not goes_on
     instabilities = (row for row in path if row["label"] in LOCATED and not row["branch"])

@@ -30,8 +30,8 @@ NAN_COLUMNS = ("stretching", "bending", "energy")
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
     """Return the name of the point of `w_pole_over_h`.
 
-    It is the first named point, whose columns are in `row`. Without one it is `pole`, see
-    `pole_of`.
+    It is the first named point of the case: `row` has its displacement in columns NAME_ux and so
+    on. Without a named point it is `pole`, the name of that point on the shape of the shell.
     """
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), pole)
 
@@ -78,17 +78,16 @@ class PathTable:
     ----------
     complete_rows
         The complete rows of an existing file, as text; an incomplete last row is cut off.
+
+    The field `_columns` has the names of the columns, and `_file` is the file as it is appended to.
     """
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
-        """Open the file after its complete rows, or begin it with its header.
-
-        `_columns` are the names of the columns, and `_file` is the file as it is appended to.
-        """
+        """Open the file after its complete rows, or begin it with its header."""
         self._columns = (*COLUMNS, *extra)
         header = table_text([self._columns])
         content = read_result(file) if file.exists() else b""
-        length = content.rfind(b"\n") + 1  # of the complete rows, with the header
+        length = content.rfind(b"\n") + 1  # bytes of the header and the complete rows
         if length and not content.startswith(header.encode()):
             raise Damaged(f"{file}: is damaged: its columns are not those of this run")
         self.complete_rows = read_lines(file) if length else []
@@ -166,7 +165,12 @@ def is_path(file: Path) -> bool:
 def read_rows(file: Path) -> list[Row]:
     """Return the complete rows of a path.csv, with numbers where columns are numbers.
 
-    It also reads the table of a killed run; it raises as `read_lines`.
+    It also reads the table of a killed run, whose last line may be incomplete.
+
+    Raises
+    ------
+    Damaged
+        If a column is missing or a line is not from a run; the message names the first such line.
     """
     return [
         {key: v if key in TEXTS else _number(v) for key, v in row.items()}
@@ -193,9 +197,9 @@ def read_lines(file: Path) -> list[dict[str, str]]:
         raise Damaged(
             f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}"
         )
-    # columns of whole numbers; lines are numbered from 1, the header's number
-    counts = {name for name in head if quantity(name).kind == "count"}
+    counts = {name for name in head if quantity(name).kind == "count"}  # columns of whole numbers
     rows = []
+    # row `number` is line number + 2 of the file: the header is line 1
     for number, values in enumerate(lines[1:]):
         rows.append(dict(zip(head, values, strict=False)))
         if len(values) != len(head):

@@ -9,12 +9,16 @@ derivatives of the penalty itself, by the displacement and by the approach, for 
 body. Where the thickness varies, or is that of a shell that gets thinner as it stretches, t is one
 more variable of the polynomial. docs/theory.md, Contact.
 
-The approach is a load parameter: how far the body has moved from where it is at first. psi is the
-penalty energy per undeformed area, a function of the penetration (minus the gap). The expansion
-point is the y for which a polynomial was computed; P are a polynomial's coefficients, F those by
-the thickness. A jet is a map with its first and second derivatives at quadrature points, a density
-an energy per undeformed area as a function of jets. A memo is a value that is computed again where
-its inputs have changed. Lengths are over R, the approach is over h, psi over E h.
+- The approach a is a load parameter: how far the body has moved from where it is at first.
+- psi is the penalty energy per undeformed area, a function of the penetration (minus the gap).
+- The expansion point is the y for which a polynomial was computed. P are a polynomial's
+  coefficients: the expansion point in P[0:3], psi there in P[3], its gradient in P[4:7], its
+  Hessian in P[7:13]. F are t at the expansion point, and the derivatives by t.
+- A point is pressed if its gap is closed.
+- A jet is a map with its first and second derivatives at quadrature points, a density an energy per
+  undeformed area as a function of jets.
+- A memo is a value that is computed again where its inputs have changed: `renew` returns it.
+- Lengths are over R, the approach is over h, psi over E h.
 """
 
 from collections.abc import Callable
@@ -125,7 +129,7 @@ def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face
     r0, u
         Jets (values and derivatives) of the undeformed placement and of the displacement.
     P
-        (`POLYNOMIAL_SIZE`,) coefficients at the point, see `BodyContact.polynomial`.
+        (`POLYNOMIAL_SIZE`,) coefficients of the polynomial at the point.
     motion
         Displacement (3,) of the body over R for an approach of one thickness.
     approach
@@ -135,7 +139,7 @@ def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face
         thickness over h, (1,).
     """
     # r0 is an argument of all densities, and not needed here
-    s = _off_expansion_point(u, P, motion, approach)
+    s = _off_expansion_point(u, P, motion, approach)  # offset (3,) from the expansion point
     psi = _polynomial(P, s)
     if not face:
         return psi
@@ -160,8 +164,12 @@ def thinned_energy(
 
     Parameters
     ----------
-    r0, u, P, motion, approach
-        See `contact_energy`.
+    r0, u
+        Jets of the undeformed placement and of the displacement.
+    P
+        (`POLYNOMIAL_SIZE`,) coefficients of the polynomial at the point.
+    motion, approach
+        Displacement (3,) of the body over R for an approach of one thickness; approach over h.
     F
         (`FACE_SIZE`,) derivatives of psi by the thickness factor.
     factor
@@ -178,7 +186,8 @@ def thinned_energy(
 
 def _polynomial(P: Expr, s: Expr) -> Expr:
     """Return psi at an offset s (3,) from the expansion point of the polynomial P."""
-    pairs = enumerate(zip(*INDEX_PAIRS, strict=True))  # of the Hessian, at P[7] and after it
+    # numbers n with index pairs (i, j) of the Hessian, whose entries are P[7 + n]
+    pairs = enumerate(zip(*INDEX_PAIRS, strict=True))
     return (
         P[3]
         + ufl.dot(_gradient(P), s)
@@ -193,9 +202,8 @@ def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
     factor, the mixed derivatives (3,) by factor and place, and the second derivative by the factor.
     """
     change = t - F[0]
-    return change * (
-        F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + change / 2 * F[5]
-    )
+    mixed_derivatives = ufl.as_vector([F[2 + i] for i in range(3)])
+    return change * (F[1] + ufl.dot(mixed_derivatives, s) + change / 2 * F[5])
 
 
 def contact_pressure(
@@ -204,7 +212,7 @@ def contact_pressure(
     """Return the contact pressure per undeformed area over E h/R, as a UFL expression.
 
     It is the norm of the gradient of psi at the expansion point, that is at the state for which P
-    was computed. The other parameters only serve to make it a density like `contact_energy`.
+    was computed. The other parameters are not used here: densities have them as arguments.
     """
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
@@ -284,13 +292,14 @@ class _ActivePenalty:
     n: Array
     N: Array
 
-    def penalty(self) -> tuple[NDArray[np.bool_], Array]:
+    def flags_and_coefficients(self) -> tuple[NDArray[np.bool_], Array]:
         """Return the flags of the pressed points, and the polynomial coefficients of psi there.
 
         Returns
         -------
         is_pressed, coefficients
-            (points,) the flags, and (m, 10) the coefficients of `_flattened` at pressed points.
+            (points,) the flags, and (m, 10) the coefficients at pressed points: psi, its gradient
+            (3) and its Hessian (6) by the place, as P[3:] of a polynomial.
         """
         # derivatives of psi by the place: the penetration has the gradient -n and the Hessian -N
         H = (
@@ -334,16 +343,28 @@ def _thickness_factor(
     """
 
     def factor() -> float | Array:
-        factor: float | Array = 1.0
+        """Return the thickness over h: the undeformed one, times the ratio."""
+        undeformed: float | Array = 1.0
         if thickness is not None:
-            factor = at_quadrature(thickness, points)[..., 0].ravel()
-        return factor if ratio_memo is None else factor * ratio_memo.renew()
+            undeformed = at_quadrature(thickness, points)[..., 0].ravel()
+        return undeformed if ratio_memo is None else undeformed * ratio_memo.renew()
 
     def thicknesses() -> tuple[Array, ...]:
+        """Return the arrays that the thickness depends on."""
         undeformed_thickness = () if thickness is None else (thickness.x.array,)
         return (*undeformed_thickness, ratio_memo.renew()) if ratio_memo else undeformed_thickness
 
     return factor, thicknesses
+
+
+def _times(c: Array, a: Array) -> Array:
+    """Return numbers c (points,) times arrays a (points, ...)."""
+    return c.reshape(-1, *[1] * (a.ndim - 1)) * a
+
+
+def _outer_square(a: Array) -> Array:
+    """Return the products a_i a_j (points, 3, 3) of the components of vectors a (points, 3)."""
+    return a[:, :, None] * a[:, None, :]
 
 
 class BodyContact:
@@ -365,7 +386,8 @@ class BodyContact:
     thickness
         The thickness over h; None where it is h.
     ratio_at_points
-        The deformed over the undeformed thickness, see `gap.thickness_ratio_at_points`; None for 1.
+        Function from points in a reference cell to a memo of the deformed over the undeformed
+        thickness there; None for 1.
 
     Attributes
     ----------
@@ -377,11 +399,18 @@ class BodyContact:
     stiffness
         Stiffness k of the penalty, over E h/R^2.
 
-    The field `_points` has the points of the rule in a reference cell, and `_owned` is the number
-    of cells that are not ghosts. `_face_field` has the derivatives by the thickness as `polynomial`
-    has those by the place; None where the thickness is h. `_step_derivatives` are the forces of a
-    step in time, see `average`, and `_expansion_gap` the gaps of `expand_about`; both are empty
-    tuples without.
+    The field `_points` has the points of the quadrature in a reference cell, and `_owned` is the
+    number of cells that are not ghosts. `_face_field` (cells, points, `FACE_SIZE`) has the
+    thickness factor t and the derivatives by t; None where the thickness is h.
+
+    `_step_derivatives` are those of the mean forces of a step in time, if they count in place of
+    the present ones: the gradient (points, 3) and Hessian (points, 3, 3) of psi by the place, and
+    its derivatives by t (points, 5). `_expansion_gap` are the gaps (points,) about which the
+    penalty is expanded, if these are not the present ones. Both are empty tuples otherwise.
+
+    The memos are those of the placement r0 (cells, points, 3) at the points, the factor t, the gap
+    with its gradient and Hessian (`_gap_memo`), and the penalty (`_penalty_memo`). Points of all
+    cells are also counted in one row: (points,) stands for (cells * points,).
     """
 
     def __init__(
@@ -418,27 +447,31 @@ class BodyContact:
             self.parameters = *self.parameters, thickness
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        # of a step in time, in place of the present ones: gradient (points, 3) and Hessian (points,
-        # 3, 3) of psi by the place, and its derivatives by the thickness factor (points, 5)
         self._step_derivatives: tuple[Array, ...] = ()
-        self._expansion_gap: tuple[Array, ...] = ()  # about which the penalty is expanded
+        self._expansion_gap: tuple[Array, ...] = ()
 
-        # inputs of the memos: what gaps depend on, and what the penalty depends on besides
-        def places() -> tuple[Array, ...]:
+        def inputs_of_gaps() -> tuple[Array, ...]:
+            """Return the arrays that gaps depend on."""
             return r0.x.array, u.x.array, approach.value, *thicknesses()
 
-        def forces() -> tuple[Array, ...]:
-            return *places(), self.stiffness.value, *self._step_derivatives, *self._expansion_gap
+        def inputs_of_forces() -> tuple[Array, ...]:
+            """Return the arrays that the penalty and its derivatives depend on."""
+            return (
+                *inputs_of_gaps(),
+                self.stiffness.value,
+                *self._step_derivatives,
+                *self._expansion_gap,
+            )
 
-        self._gap_memo = Memo(lambda: self._gap_at(self.place, self.factor), places)
-        self._penalty_memo = Memo(self._active_penalty, forces)
-        self.polynomial.compute_by(self._compute_polynomials, forces)
+        self._gap_memo = Memo(lambda: self._gap_at(self.place, self.factor), inputs_of_gaps)
+        self._penalty_memo = Memo(self._active_penalty, inputs_of_forces)
+        self.polynomial.compute_by(self._compute_polynomials, inputs_of_forces)
         if self._face_field is not None:
-            self._face_field.compute_by(self._compute_face_terms, forces)
+            self._face_field.compute_by(self._compute_face_terms, inputs_of_forces)
 
     @property
     def history(self) -> tuple[str, tuple[fem.Constant, float]]:
-        """The name, constant and default of its stiffness, see `FiniteElementSystem`."""
+        """The name, constant and default of its stiffness, which a state stores by this name."""
         return self.contact.setting, (self.stiffness, self.contact.stiffness)
 
     @property
@@ -448,8 +481,9 @@ class BodyContact:
 
     @property
     def gap(self) -> Array:
-        """The gaps at all points, over R."""
-        return self._gap_memo.renew()[0]
+        """The gaps (points,) over R, at the points of all cells."""
+        gaps, *_ = self._gap_memo.renew()
+        return gaps
 
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
         """Return the gap (points,), its gradient (points, 3) and its Hessian (points, 3, 3).
@@ -457,7 +491,7 @@ class BodyContact:
         Parameters
         ----------
         y
-            (cells, points, 3) displacements relative to the body, see `place`.
+            (cells, points, 3) displacements u - a d relative to the body, over R.
         factor
             Thickness over h, one number or (cells * points,).
         """
@@ -468,8 +502,8 @@ class BodyContact:
     def _active_penalty(self) -> "_ActivePenalty":
         """Return the penalty at the points whose gap is closed, which are few of all.
 
-        The penalty is expanded about the gap that `expand_about` has set, and the points are those
-        where that gap is closed. Without one it is expanded about the present gap, and exact.
+        If `expand_about` has set gaps, the penalty is expanded about these, and the points are
+        those where these gaps are closed. Otherwise the penalty is that of the present gap.
         """
         gap, n, N = self._gap_memo.renew()
         expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
@@ -484,21 +518,25 @@ class BodyContact:
     def _compute_polynomials(self) -> Array:
         """Return the coefficients (cells, points, `POLYNOMIAL_SIZE`) of psi at the present state.
 
-        Where the forces of a step count (`average`), they are those of the step.
+        While the mean forces of a step are used in place of the present ones (`average`), the
+        coefficients are theirs.
         """
         y = self.place
         polynomials = np.zeros((*y.shape[:2], POLYNOMIAL_SIZE))
         polynomials[..., :3] = y  # the expansion point; other coefficients are zero at open points
-        is_pressed, coefficients = (
-            self._step_mean() if self._step_derivatives else self._penalty_memo.renew().penalty()
-        )
+        # the other coefficients (m, 10) at the points that are flagged among all points
+        if self._step_derivatives:
+            is_pressed, coefficients = self._step_mean()
+        else:
+            is_pressed, coefficients = self._penalty_memo.renew().flags_and_coefficients()
         polynomials.reshape(-1, POLYNOMIAL_SIZE)[is_pressed, 3:] = coefficients
         return polynomials
 
     def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
-        """Return the flags of all points, and the coefficients of the mean force of a step there.
+        """Return flags (points,), which are all set, and coefficients (points, 10) of psi there.
 
-        They are in the form of `_ActivePenalty.penalty`, with zero for the value of psi.
+        The coefficients are those of the mean force of a step: P[3:] of polynomials, with zero for
+        the value of psi.
         """
         gradient, H, _ = self._step_derivatives
         no_values = np.zeros((len(gradient), 1))  # of psi, which does not enter the forces
@@ -510,17 +548,17 @@ class BodyContact:
         After t come the first derivative, the mixed ones by t and place (3), and the second one.
         """
         active, half = self._penalty_memo.renew(), self._h / 2
-        by_t = np.zeros((len(active.is_pressed), FACE_SIZE))
-        by_t[:, 0] = self.factor
+        face_terms = np.zeros((len(active.is_pressed), FACE_SIZE))
+        face_terms[:, 0] = self.factor
         if self._step_derivatives:
             *_, step_by_t = self._step_derivatives
-            by_t[:, 1:] = step_by_t
+            face_terms[:, 1:] = step_by_t
         else:
             # the penetration grows by h/2 with t, and by -n with the place
-            by_t[active.is_pressed, 1:] = half * np.concatenate(
+            face_terms[active.is_pressed, 1:] = half * np.concatenate(
                 [active.first, -active.second * active.n, half * active.second], axis=1
             )
-        return by_t.reshape(*self.polynomial.values.shape[:2], FACE_SIZE)
+        return face_terms.reshape(*self.polynomial.values.shape[:2], FACE_SIZE)
 
     def expand_about(self, gap: Array) -> None:
         """Replace the penalty by its Taylor polynomial about given gaps, for all later states.
@@ -531,7 +569,7 @@ class BodyContact:
         Parameters
         ----------
         gap
-            (points,) over R, of the same contact at the state to expand about; see `gap`.
+            (points,) over R: the gaps of this contact at the state to expand about.
         """
         self._expansion_gap = (gap,)
 
@@ -568,7 +606,8 @@ class BodyContact:
         Parameters
         ----------
         begin, end
-            `point_state` at both ends of the step.
+            Displacements y relative to the body, and thickness factors, at both ends of the step:
+            the values of `point_state` there.
         part
             Position within the step, from 0 to 1, at which the system takes its forces.
         """
@@ -586,27 +625,21 @@ class BodyContact:
         mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
         _, p0, _ = penalty(s0, k, soft_penetration)
         _, p1, k1 = penalty(s1, k, soft_penetration)
-
-        def outer(a: Array) -> Array:
-            """Return the products (points, 3, 3) of the components of vectors (points, 3)."""
-            return a[:, :, None] * a[:, None, :]
-
-        def times(c: Array, a: Array) -> Array:
-            """Return numbers (points,) times arrays (points, ...)."""
-            return c.reshape(-1, *[1] * (a.ndim - 1)) * a
-
-        # the terms with off_middle are the dissipative force; only the end of the step is varied
+        # psi by the place: the penetration has the gradient -n. The terms with off_middle are the
+        # dissipative force; second derivatives are those by the end of the step alone
         off_middle = part - 0.5
-        gradient = -times(mean_slope, normal) - off_middle * (times(p1, n[2]) - times(p0, n[0]))
+        gradient = -_times(mean_slope, normal) - off_middle * (_times(p1, n[2]) - _times(p0, n[0]))
         H = (
-            times(mean_curvature, outer(normal))
-            - times(mean_slope, mean_hessian)
-            + off_middle * (times(k1, outer(n[2])) - times(p1, N[2]))
+            _times(mean_curvature, _outer_square(normal))
+            - _times(mean_slope, mean_hessian)
+            + off_middle * (_times(k1, _outer_square(n[2])) - _times(p1, N[2]))
         )
+        # psi by the thickness factor t, with which the penetration grows by h/2
         by_t = half * (mean_slope + off_middle * (p1 - p0))
-        mixed = -half * (times(mean_curvature, normal) + off_middle * times(k1, n[2])) / part
+        mixed = -half * (_times(mean_curvature, normal) + off_middle * _times(k1, n[2])) / part
         second_by_t = half**2 * (mean_curvature + off_middle * k1) / part
-        # second derivatives are by the displacement at `part`, hence the division
+        # the end moves by 1/part of the motion at `part`, by which the system differentiates: hence
+        # the division of second derivatives
         self._step_derivatives = (
             gradient,
             np.asarray(H / part),
@@ -623,7 +656,7 @@ class BodyContact:
         Values at nodes would not resolve the ring of a contact, which is narrower than a cell.
         """
         V = self._u.function_space
-        weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
+        _, weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)
         return np.asarray(self._pressures() @ weights / weights.sum())
 
     def evenly_pressed(self) -> NDArray[np.bool_]:
@@ -640,7 +673,8 @@ class BodyContact:
     def _pressures(self) -> Array:
         """Return the contact pressure at the points of local cells (cells, points), over E h/R."""
         self.polynomial.renew()
-        return np.asarray(np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1))
+        gradients_of_psi = self.polynomial.values[..., 4:7]
+        return np.asarray(np.linalg.norm(gradients_of_psi, axis=-1))
 
     def region(self, comm: MPI.Comm, radius: float) -> Region:
         """Return the region where the body touches the shell; collective.
@@ -650,7 +684,8 @@ class BodyContact:
         comm
             Communicator of the mesh.
         radius
-            Mean radius of the contact over R, which the caller integrates by `radius_density`.
+            Mean radius of the contact over R, which becomes that of the region. The caller
+            integrates it by `radius_density`.
         """
         # points of owned cells alone: ghosts belong to other ranks
         owned = slice(0, self._owned * len(self._points))

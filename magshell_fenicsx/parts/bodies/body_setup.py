@@ -85,10 +85,7 @@ def _contact(
     """Return one rigid body of a case at its place, with the stiffness of its penalty.
 
     By default the body touches the shell at the section's `at`, with the shell's normal there as
-    its direction. A body with a `position` and no `at` has the default of `at`. But where that
-    normal is not needed, as the direction is given, the nearest place of the shell stands for `at`;
-    so it does on a mesh. The default stiffness is larger for a body of finite radius than for a
-    plane.
+    its direction. The default stiffness is larger for a body of finite radius than for a plane.
 
     Parameters
     ----------
@@ -103,24 +100,17 @@ def _contact(
         If the body penetrates the undeformed shell at approach zero.
     """
     key, h, Q = f"bodies.{name}", reference.h, reference.Q
-    has_own_place = section.position is not None and "at" not in section.model_fields_set
-    # the nearest sample, unless the normal at the default `at` is to give the direction
-    if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
-        places = reference.perfect.sample()
-        from_body = places - np.array(section.position) / reference.R
-        place = places[np.linalg.norm(from_body, axis=1).argmin()]
-    else:
-        place, _ = locate(section.at, reference, key)
+    place = _place_on_shell(section, reference, key)
     chart = reference.perfect.inverse(place)
-    # where the body touches: on the imperfect shell, with the normal of the perfect one. The chart
-    # of a mesh file is the place itself (3,): there is no map from a chart to the surface
+    # the start: where the body touches, on the imperfect shell, with the normal of the perfect one.
+    # The chart of a mesh file is the place itself (3,): it has no map from a chart to the surface
     normal = reference.perfect.normal_near(chart)
     start = place if len(chart) == 3 else reference.imperfect.embedding(chart[None])[0]
     half_thickness = float(reference.half_thickness(start[None])[0])
     placed_body = place_body(
         section, key, start, normal / np.linalg.norm(normal), half_thickness, Q, reference.R
     )
-    # the default stiffness is a number times D/(R h)^2; D is over E h R^2, the radius over R
+    # the default stiffness is a number times D/(R h)^2; here D is over E h R^2, the radius over R
     D, body_radius = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
     stiffness = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * _stiffness_ratio(body_radius)
     starts_at_shell = section.position is None
@@ -137,16 +127,48 @@ def _contact(
         start=Q @ start if starts_at_shell else None,
         lift=placed_body.front - Q @ start if starts_at_shell else None,
     )
-    depth = -least_gap(contact, reference)
+    _refuse_penetration(contact, reference, key)
+    return contact
+
+
+def _place_on_shell(section: BodySection, reference: ReferenceShell, key: str) -> Array:
+    """Return the place (3,) over R of the perfect shell that stands for the section's `at`.
+
+    It is `at`, or its default, unless the body has a `position` and no `at`. Then it is the place
+    of the shell that is nearest to the position, if the normal at the default of `at` is not needed
+    since the direction is given, or if the shell is a mesh.
+
+    Parameters
+    ----------
+    key
+        Key of the body in the case file, for messages.
+    """
+    has_own_place = section.position is not None and "at" not in section.model_fields_set
+    if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
+        places = reference.perfect.sample()
+        from_body = places - np.array(section.position) / reference.R
+        return np.asarray(places[np.linalg.norm(from_body, axis=1).argmin()])
+    place, _ = locate(section.at, reference, key)
+    return place
+
+
+def _refuse_penetration(contact: ContactBody, reference: ReferenceShell, key: str) -> None:
+    """Refuse a body that penetrates the undeformed shell at approach zero.
+
+    Raises
+    ------
+    CaseError
+        With the key of the body, and the depth.
+    """
+    h, depth = reference.h, -least_gap(contact, reference)
     if depth > PENETRATION_TOLERANCE * h:
         position_key, hint = "position", "move it back"
-        if starts_at_shell:
+        if contact.start is not None:  # the body has no position of its own
             position_key, hint = "at", "give a place `at` that it reaches first, or its `position`"
         raise CaseError(
             f"{key}.{position_key}: the body penetrates the undeformed shell by {depth / h:.4g} h "
             f"at approach 0; {hint}"
         )
-    return contact
 
 
 def _stiffness_ratio(body_radius: float) -> float:
@@ -181,6 +203,15 @@ class ContactZone:
         For a plane its radius is about that of a ring, sqrt(2 R a) at an approach a, with margins.
         For other bodies it is at most their radius and a margin. Without a target of the approach,
         ten thicknesses are assumed.
+
+        Parameters
+        ----------
+        contact
+            The body.
+        loads
+            The steps of the case, of which those of `kind: contact` have a target of the approach.
+        reference
+            The undeformed shell.
         """
         h, size = reference.h, contact.size
         approach = largest_approach(loads) or 10.0
@@ -193,20 +224,26 @@ class ContactZone:
 
         Parameters
         ----------
+        outline
+            Not used here.
+        sizing
+            Thickness h over R, and the refinement, which divides sizes of elements.
         growth
             Growth of the element size with the distance from the disc.
         """
         x, y = map(float, self.place)
-        ring_width, size = sqrt(sizing.h), self.size
-        # here `size` is the radius of the body, in a feature the size of elements
-        ring_elements = RING_SIZE * ring_width / sizing.refinement
+        ring_width, body_radius = sqrt(sizing.h), self.size
+        # sizes of elements: those that resolve the ring, and those that resolve the body
+        ring_size = RING_SIZE * ring_width / sizing.refinement
         features: list[Feature] = [
-            DiscFeature((x, y), radius=self.reach, size=ring_elements, growth=growth)
+            DiscFeature((x, y), radius=self.reach, size=ring_size, growth=growth)
         ]
-        if size < ring_width:
+        if body_radius < ring_width:
             # three elements per radius, but no finer than h/10; the numbers are rules of thumb
-            body_elements = max(size / 3, 0.1 * sizing.h)
-            features.append(DiscFeature((x, y), radius=1.5 * size, size=body_elements, growth=0.4))
+            body_size = max(body_radius / 3, 0.1 * sizing.h)
+            features.append(
+                DiscFeature((x, y), radius=1.5 * body_radius, size=body_size, growth=0.4)
+            )
         return features
 
 
@@ -226,20 +263,22 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
 
     The signed distances at random places and at their images are compared.
     """
-    random_places = np.random.default_rng(17).uniform(-2, 2, (40, 3))
-    distances, direction = contact.distance(random_places)[0], contact.direction
+    random_places, direction = np.random.default_rng(17).uniform(-2, 2, (40, 3)), contact.direction
+    distances, *_ = contact.distance(random_places)  # without gradients and Hessians
 
     def is_image(S: Array, image: Array) -> bool:
         """Return whether a map S preserves the direction, and distances at the places' images."""
         keeps_direction = np.abs(S @ direction - direction).max() < SYMMETRY_TOLERANCE
-        change = np.abs(contact.distance(image)[0] - distances).max()
+        distances_at_image, *_ = contact.distance(image)
+        change = np.abs(distances_at_image - distances).max()
         tolerance = SYMMETRY_TOLERANCE * (1 + np.abs(distances).max())
         return bool(keeps_direction and change < tolerance)
 
-    # two turns by angles (rad) that no symmetry of finite order has
+    # whether all turns about e3 preserve the body: two stand for all, since no turn by a fraction
+    # of a circle has these angles (rad)
     is_turned = all(is_image(Q, random_places @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
     # vectors that a mirror plane of the body must contain
-    held_vectors = [contact.front, direction, *contact.distance.mirror_vectors]
+    vectors_in_plane = [contact.front, direction, *contact.distance.mirror_vectors]
     # azimuths of possible mirror planes: each goes through e3 and a vector, which must not be along
     # e3
     azimuths = tuple(
@@ -249,12 +288,13 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
     )
 
     def mirrors(mirror: Mirror) -> bool:
+        """Return whether the reflection at a plane preserves the body."""
         return is_image(mirror.reflection, mirror.image(random_places))
 
     return SymmetryConstraint(
-        None if is_turned else f"bodies.{contact.body} is not turned about e3",
-        held_vectors,
-        mirrors,
+        not_axisymmetric=None if is_turned else f"bodies.{contact.body} is not turned about e3",
+        vectors=vectors_in_plane,
+        mirrors=mirrors,
         azimuths=azimuths,
     )
 
@@ -267,6 +307,7 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
     outline = reference.imperfect
 
     def gap(x: Array) -> Array:
+        """Return gaps (n,) at undeformed places x (n, 3) of the shell, in the case's frame."""
         half = reference.half_thickness(x)
         gaps, *_ = contact.gap(x @ reference.Q.T, approach=0.0, half=half)
         return gaps
@@ -277,11 +318,12 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
     # the search goes on in a box around the best sample; half its side is a tenth of the chart
     reach = np.full(2, 0.1 * float(np.ptp(chart, axis=0).max()))
 
-    def on_chart(x: Array) -> Array:
-        return gap(outline.embedding(np.array([outline.clip_to_chart(p) for p in x])))
+    def gap_on_chart(points: Array) -> Array:
+        """Return gaps (n,) at points (n, 2) of the chart; points outside are moved to its edge."""
+        return gap(outline.embedding(np.array([outline.clip_to_chart(p) for p in points])))
 
     values = gap(outline.embedding(chart))
-    return _refined_minimum(on_chart, chart[values.argmin()], float(values.min()), reach)
+    return _refined_minimum(gap_on_chart, chart[values.argmin()], float(values.min()), reach)
 
 
 def overlap(body: ContactBody, other: ContactBody) -> float:
@@ -292,7 +334,10 @@ def overlap(body: ContactBody, other: ContactBody) -> float:
     """
 
     def larger_distance(x: Array) -> Array:
-        return np.maximum(body.distance(x)[0], other.distance(x)[0])
+        """Return the larger signed distance (n,) of both bodies at places x (n, 3)."""
+        distance, *_ = body.distance(x)
+        distance_from_other, *_ = other.distance(x)
+        return np.maximum(distance, distance_from_other)
 
     # random places near the shell, and the points where bodies are most likely to meet
     x = np.concatenate(
@@ -303,7 +348,10 @@ def overlap(body: ContactBody, other: ContactBody) -> float:
     )
     values = larger_distance(x)
     return -_refined_minimum(
-        larger_distance, x[values.argmin()], float(values.min()), np.full(3, 0.5)
+        larger_distance,
+        best=x[values.argmin()],
+        minimum=float(values.min()),
+        reach=np.full(3, 0.5),
     )
 
 

@@ -76,11 +76,14 @@ class ContactSection(PathStep):
         return self.body
 
     def name_in(self, context: Context, loads: Sequence[Step]) -> str:
-        """Return the name of the load parameter that this step drives."""
-        names = approaches(context.sections["bodies"], loads)
+        """Return the name of the load parameter that this step drives: the approach of its body.
+
+        `loads` are the loads of all steps of the case, on which the names of approaches depend.
+        """
+        name_by_body = approaches(context.sections["bodies"], loads)
         # a step without `body` is for the only one; `refuse_unfit` reports other cases
-        body = str(self.body or next(iter(names), ""))
-        return names.get(body, self.amplitude)
+        body = str(self.body or next(iter(name_by_body), ""))
+        return name_by_body.get(body, self.amplitude)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         """Refuse a step whose body is not in the case, or is missing where there are several.
@@ -108,8 +111,16 @@ class ContactSection(PathStep):
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the first change of the approach, over h.
 
-        By load it is the change over the number of points. Towards a force it is `FIRST_APPROACH`,
-        forward if the force is to grow: the conjugate is minus the force on the body.
+        `load_start` is not used here.
+
+        Parameters
+        ----------
+        change
+            Change from the begin of the step to its target: of the approach, or of the conjugate,
+            which is minus the force on the body.
+        by_load
+            Whether `change` is one of the approach. The result is then `change` over the number of
+            points. Towards a force it is `FIRST_APPROACH`, forward if the force is to grow.
         """
         return change / self.points if by_load else copysign(FIRST_APPROACH, -change)
 
@@ -117,8 +128,10 @@ class ContactSection(PathStep):
 def contact_step_options(options: "StepOptions") -> "StepOptions":
     """Return step control for a path along which contact sets in, grows and ceases.
 
-    It allows smaller steps, and more Newton iterations before a step counts as hard, than the given
-    options: the active set of a contact changes within a step.
+    The active set of a contact changes within a step. So the result allows smaller steps than the
+    given options, and more Newton iterations and factorisations of matrices. Up to
+    `EASY_ITERATIONS` of them the next step may be longer; from `HARD_ITERATIONS` factorisations on
+    it is shorter.
     """
     return replace(
         options,
@@ -209,12 +222,17 @@ class BodiesObservables(Observables):
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
         """Return a mapping: name of each approach -> column of the force on that body."""
-        return {
-            contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts
-        }
+        column_by_approach = dict[str, str]()
+        for contact in loads.contacts:
+            _, force_column, *_ = contact_columns(contact.amplitude)
+            column_by_approach[contact.amplitude] = force_column
+        return column_by_approach
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return the columns of all bodies, except `force`, which every run has."""
+        """Return the columns of all bodies, except `force`, which every run has.
+
+        `supports` are not used here.
+        """
         names = (
             column for contact in loads.contacts for column in contact_columns(contact.amplitude)
         )
@@ -223,11 +241,13 @@ class BodiesObservables(Observables):
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return the values of all bodies' columns at a state, in the units of the view.
 
-        The mapping is column -> number; see `contact_columns`. Collective.
+        The mapping is column -> number. The columns of each body are its approach, the force on it,
+        the penetration, three radii of the contact, and the stiffness of the penalty. Collective.
         """
         model, h, values = view.model, view.h, dict[str, float]()
-        for name in model.contacts:
-            # the potential of an approach is dPi/da, which over the unit is the force on the body
+        for name in model.contacts:  # by the name of the body's approach
+            # the potential of an approach is dPi/da; over a positive unit it is the force on the
+            # body, but the unit of the conjugate is negative
             region, potential = model.region(state, name), view.potential(state, name)
             force = -potential / self._unit(view)
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
@@ -242,6 +262,7 @@ class BodiesObservables(Observables):
         return self._unit(view) if name in view.model.contacts else None
 
     def _unit(self, view: ModelView) -> float:
+        """Return -dPi/da for a force of one unit on the body: minus the unit of force, times h."""
         return -view.model.force_unit * view.h
 
 

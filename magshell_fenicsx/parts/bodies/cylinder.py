@@ -43,7 +43,8 @@ class CylinderBodySection(BodySection):
 class Cylinder(Distance):
     """Signed distance of a cylinder without ends; lengths are over R.
 
-    It is the distance of a sphere after projection across the unit vector `axis` (3,).
+    All places are projected onto the plane through `centre` (3,) normal to the unit vector `axis`
+    (3,). There it is the distance from a sphere of this radius.
     """
 
     centre: Array

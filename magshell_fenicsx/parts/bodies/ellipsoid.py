@@ -81,13 +81,13 @@ class Ellipsoid(Distance):
         are those of the ellipsoid at the nearest place.
         """
         y = (x - self.centre) @ self.axes.T  # coordinates along the ellipsoid's axes
-        foot = self.nearest(y)
-        normal = foot / self.semi**2
-        normal_length = np.linalg.norm(normal, axis=1)  # of half the gradient of sum (y_i/a_i)²
+        foot = self.nearest(y)  # the nearest places of the surface
+        normal = foot / self.semi**2  # half the gradient of sum (y_i/a_i)², which is normal to it
+        normal_length = np.linalg.norm(normal, axis=1)
         n = normal / normal_length[:, None]
         g = np.einsum("ni,ni->n", y - foot, n)
-        # the curvatures of the surface as a tensor: the second derivative of sum (y_i/a_i)²/2 over
-        # the length of the first, projected onto the tangent plane
+        # the curvatures of the surface as a tensor S: the second derivative of sum (y_i/a_i)²/2
+        # over the length of the first, projected onto the tangent plane
         tangent_projection = np.eye(3) - n[:, :, None] * n[:, None, :]
         second_derivative = np.eye(3) / self.semi**2 / normal_length[:, None, None]
         S = tangent_projection @ second_derivative @ tangent_projection
@@ -99,7 +99,8 @@ class Ellipsoid(Distance):
     def nearest(self, y: Array) -> Array:
         """Return the places (n, 3) of the surface that are nearest to places y (n, 3).
 
-        Both are coordinates along the ellipsoid's axes, from its centre.
+        Both are coordinates along the ellipsoid's axes, from its centre. They follow from the
+        parameter t, the root of F that Newton's method finds (see the class).
         """
         a = self.semi
         size = np.maximum(np.abs(y), PLANE_OFFSET * a)  # |y|: in the octant of positive coordinates
@@ -108,7 +109,7 @@ class Ellipsoid(Distance):
         for _ in range(MAX_NEWTON_ITERATIONS):
             ratio = a * size / (t[:, None] + a**2)
             F = (ratio**2).sum(axis=1) - 1
-            slope = -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)
+            slope = -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)  # dF/dt
             step = -F / slope
             t = t + step
             if np.abs(step).max(initial=0.0) <= PARAMETER_TOLERANCE * a.max() ** 2:

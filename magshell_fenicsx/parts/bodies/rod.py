@@ -69,9 +69,10 @@ class Rod(Distance):
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3).
 
-        In cylinder coordinates (rho, z) the rod is a corner with a rounded edge. Its core has the
-        radius less `edge`, and its end is as much behind. In space the Hessian also has n_rho/rho
-        around the axis.
+        In cylinder coordinates (rho, z) the rod is a corner with a rounded edge: all that is nearer
+        than `edge` to its core. The core is a sharp cylinder; its radius is smaller by `edge`, and
+        its end is behind the rod's end by `edge`. In space the Hessian also has the component
+        n_rho/rho around the axis.
         """
         # cylinder coordinates from the end, and those from the corner of the core
         r, d = x - self.end, self.along

@@ -1,16 +1,22 @@
 """The search for the places of other cells that the points of a surface face, at a displacement.
 
-A tree gives the pairs of cells that are near, which stay while nodes move little; Newton's method
-the closest point in each cell (`projection`). Of these the places count from which the surface goes
-on to no nearer one. docs/theory.md, Contact.
+A tree finds the pairs of cells that are near each other. These pairs are kept while nodes move
+little. Newton's method finds the closest point in each near cell (`projection`). Of these places
+only those count from which the surface goes on to no nearer one. docs/theory.md, Contact.
 
-A point is a quadrature point of a cell. A place is its projection: a cell with coordinates X in it
-(`Projections`). Cells are near within the surface if the way between them along the undeformed
-surface is short: such cells are the material around a point, and touch it only if folded. The side
-of a cell is one of its three; the number `side` of a place is that of the direction in which the
-point faces it. Free directions are those in which a place can move: two inside a cell, one on its
-side, none in its corner. Cuts divide cells along the cells that they face (`segments`). The reach
-is the largest distance that is looked for. Lengths are over R.
+- A contact point is a quadrature point: `cell` has its cell, `shape` the shape functions there.
+- A place is a point's projection: the closest place in a cell, with coordinates X in that cell
+  (`Projections`). `point` has the number of its contact point, `distance` the distance of the two.
+- Free directions are those in which a place can move: two inside a cell, one on its side, none in
+  its corner.
+- The side of a cell is one of its three edges; `neighbours` (cells, 3) has the cell across each of
+  them, or a negative number at an open side. But the number `side` of a place is that of the
+  direction in which its point faces it: 0 for the direction of the nearest place.
+- `firsts` has the row of the first place of each point and direction.
+- Cells are near within the surface if the way between them along the undeformed surface is short.
+  Such cells are the material around a point, and touch it only if folded.
+- Cuts divide cells along the cells that they face (`segments`).
+- The reach is the largest distance that is looked for. Lengths are over R.
 """
 
 from collections.abc import Callable
@@ -48,7 +54,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 TRACKING_MARGIN = 0.5  # cells' mean radii that nodes move before near pairs are sought again
 MAX_DISTANCES_AT_ONCE = 2_000_000  # between nodes of cells that may be folded
-BLUR_DISTANCE = 1e-6  # thicknesses over which places count as one, see `JoinedPlaces`
+BLUR_DISTANCE = 1e-6  # thicknesses over which places in neighbouring cells count as one
 # thicknesses by which a place is farther than the nearest and still counts
 DISTANCE_TOLERANCE = 40 * BLUR_DISTANCE
 SAME_DIRECTION_COSINE = 0.5  # between the directions to places that are joined: folds are smaller
@@ -82,9 +88,11 @@ class ClosestPointSearch:
         (nodes,) undeformed, over R.
 
     A key i * cells + j stands for the pair of cells i and j. The field `_near_keys` has those of
-    cells that are near within the surface, in ascending order. `_undeformed_points` has the contact
-    points that were searched last, and their undeformed places. `_tracked` has for each reach the
-    near pairs of the last search, see `_near_pairs`.
+    cells that are near within the surface, in ascending order. `_undeformed_nodes` (nodes, 4) are
+    the undeformed places of nodes with half the thickness. `_undeformed_points` has the contact
+    points that were searched last, and their undeformed places. `_own_cells` are the modelled cells
+    of this rank. `_tracked` has for each reach the displacement, the reach with its margin, and the
+    pairs of near cells of the last search.
     """
 
     def __init__(
@@ -119,7 +127,7 @@ class ClosestPointSearch:
         """Return the places (nodes, 3) of all nodes at a displacement u (nodes, 3), over R.
 
         Where the thickness varies and `to_faces` is set, they are (nodes, 4). The fourth component
-        is half the thickness less h/2, so that distances are those of faces, see `projection`.
+        is half the thickness less h/2: with it distances are those of faces, plus h.
         """
         r = self._r0 + u
         if not (to_faces and self._offsets):
@@ -137,8 +145,10 @@ class ClosestPointSearch:
 
         Parameters
         ----------
+        points
+            Contact points, of which `which` selects some.
         r
-            Places of nodes, see `places_of_nodes`.
+            (nodes, 3 or 4) places of nodes, from `places_of_nodes`.
         which
             Numbers or flags of these points, or a slice; by default all.
         """
@@ -167,7 +177,10 @@ class ClosestPointSearch:
         return bool(self._comm.allreduce(len(pairs[0])))
 
     def _bounding_spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
-        """Return centres (n, 3) and radii (n,) of spheres around cells at places r of nodes."""
+        """Return centres (n, 3) and radii (n,) of spheres around cells at places r (nodes, 3).
+
+        `cell` are the numbers of n cells; by default the spheres are those of all cells.
+        """
         nodal = r[self._cells.nodes[cell]]
         centres = nodal.mean(axis=1)
         radii = np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
@@ -200,8 +213,8 @@ class ClosestPointSearch:
 
         The keys (n,) are i * cells + j.
         """
-        # where each key would stand among those of near cells; one beyond the last of them is
-        # compared with the last, from which it differs
+        # where each key would stand among the ascending keys of near cells; a key beyond the last
+        # of them is compared with the last one, from which it differs
         position = np.minimum(np.searchsorted(self._near_keys, keys), len(self._near_keys) - 1)
         return np.asarray(self._near_keys[position] == keys)
 
@@ -227,13 +240,15 @@ class ClosestPointSearch:
         spacing = LATTICE_RADIUS_FACTOR / self._cells.element.degree
         chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE  # which limits memory
         for chunk in np.array_split(np.arange(len(i)), chunks):
-            # a fold brings corners nearer to each other; most pairs are left out here
-            corners = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
-            has_shrunk = _distances_of_nodes(r, *corners) < (
-                FOLD_SHRINKAGE * _distances_of_nodes(self._r0, *corners)
+            # first the distances of corners alone, since a fold makes one of them shorter: most
+            # pairs are left out here
+            corners_of_i, corners_of_j = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
+            has_shrunk = _distances_of_nodes(r, corners_of_i, corners_of_j) < (
+                FOLD_SHRINKAGE * _distances_of_nodes(self._r0, corners_of_i, corners_of_j)
             )
             pairs = chunk[has_shrunk.any(axis=(1, 2))]
-            # all nodes of the cells of the other pairs: whether two are close now, and were apart
+            # then all nodes of the pairs that remain: whether two nodes are close now, and were
+            # apart undeformed
             first, second = i[pairs], j[pairs]
             first_nodes, second_nodes = nodes[first, :, None], nodes[second, None, :]
             margin = spacing * (radii[first] + radii[second])[:, None, None]
@@ -248,8 +263,9 @@ class ClosestPointSearch:
     def _near_pairs(self, u: Array, reach: float) -> tuple[Longs, Longs]:
         """Return pairs (i, j) of cells that are near each other; i are modelled cells of this rank.
 
-        The pairs are searched with a margin, and kept for each reach until nodes have moved that
-        far. So the result may have pairs that are a little farther than the reach.
+        The pairs are searched with a margin beyond the reach. They are kept for each reach until
+        the nodes have moved so far that a pair from beyond this margin may be near. So the result
+        may have pairs that are a little farther apart than the reach.
 
         Parameters
         ----------
@@ -292,8 +308,14 @@ class ClosestPointSearch:
         def may_touch(i: Longs, j: Longs) -> Flags:
             return np.asarray(self._may_touch(i, j) & ~self._are_near_in_surface(i * count + j))
 
-        nodes, half = self._cells.nodes, self.half_thickness
-        return gap_between_supports(supported_nodes, nodes, self._r0, u, half, may_touch)
+        return gap_between_supports(
+            supported_nodes=supported_nodes,
+            nodes=self._cells.nodes,
+            r0=self._r0,
+            u=u,
+            half_thickness=self.half_thickness,
+            may_touch=may_touch,
+        )
 
     def projections(
         self,
@@ -338,8 +360,10 @@ class ClosestPointSearch:
         ----------
         u
             (nodes, 3) displacement over R.
+        max_reach
+            Largest distance over R that is looked for.
         points
-            By default those of the rule.
+            Contact points of this rank; by default all quadrature points.
         """
         for reach in (*(share * max_reach for share in FIRST_REACHES), max_reach):
             places = self.projections(u, reach, points, least_only=True)
@@ -354,9 +378,9 @@ class ClosestPointSearch:
         """The number of each cell's connected surface, and which surfaces are separate.
 
         The numbers are (cells,). The flags (m, m) say of two of the m surfaces whether they are
-        separate: each place of one may touch each place of the other, and no cell of one is near
-        one of the other within the surface. Then the nearest place of each point counts, since the
-        surface goes on from there to no nearer one.
+        separate: each place of one may touch each place of the other, and no cell of one is near a
+        cell of the other within the surface. Of a separate surface only the place that is nearest
+        to a point counts.
         """
         # cells that share a side are connected; surfaces are the connected parts
         cell, side = np.nonzero(self._cells.neighbours >= 0)
@@ -365,7 +389,8 @@ class ClosestPointSearch:
         count, surface_of_cell = scipy.sparse.csgraph.connected_components(
             adjacency, directed=False
         )
-        # faced[a, b]: how many cells of surface b surface a may touch; one cell stands for a
+        # faced[a, b]: how many cells of surface b may be touched by surface a, for which its first
+        # cell stands
         faced = np.zeros((count, count), dtype=np.int64)
         _, first_cells = np.unique(surface_of_cell, return_index=True)
         for surface, first_cell in enumerate(first_cells):
@@ -373,8 +398,9 @@ class ClosestPointSearch:
             faced[surface] = np.bincount(surface_of_cell[faced_cells], minlength=count)
         # whether any cells of two surfaces are near within the surface
         is_near = np.zeros((count, count), dtype=bool)
-        near_cells, other_cells = self._near_keys // n, self._near_keys % n
+        near_cells, other_cells = self._near_keys // n, self._near_keys % n  # from keys i * n + j
         is_near[surface_of_cell[near_cells], surface_of_cell[other_cells]] = True
+        # whether surface a may touch all cells of surface b
         faces_all = faced == np.bincount(surface_of_cell)
         is_other = ~np.eye(count, dtype=bool)  # a surface is not separate from itself
         return surface_of_cell, faces_all & faces_all.T & ~is_near & is_other
@@ -391,7 +417,8 @@ class ClosestPointSearch:
         """Return bounds of the distance from points to their nearest places on separate surfaces.
 
         The nearest node of such a surface bounds the distance, since it is a place of the surface.
-        See `_separate_surfaces`: on a separate surface only the nearest place counts.
+        A surface is separate if all of it may touch the point's surface, and none of it is near
+        within the surface; then only its nearest place counts.
 
         Parameters
         ----------
@@ -400,12 +427,18 @@ class ClosestPointSearch:
         x, r
             (n, 3 or 4) places of all points, and (nodes, 3 or 4) of nodes.
         pairs
-            Pairs (i, j) of near cells, see `_near_pairs`.
+            (pairs,) cells i of points, and the cells j that are near them.
         max_distance
             Distance over R beyond which nodes are not looked for.
+
+        Returns
+        -------
+        ProjectionLimits
+            (pairs,) whether cell j is on a separate surface, and the bound (n,) of each point,
+            which is infinite where there is none.
         """
         surface_of_cell, are_separate = self._separate_surfaces
-        # range of half the thickness: by that the distance of faces may exceed that of a node
+        # the range of half the thickness, by which the distance of faces may exceed that of a node
         variation = 0.0
         if r.shape[1] > 3:
             variation = self._bound(r[:, 3]) + self._bound(-r[:, 3])
@@ -414,7 +447,7 @@ class ClosestPointSearch:
         is_near[faced_cells] = True
         # the points of each surface together: their distances from near nodes of all surfaces that
         # are separate from it
-        reach, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
+        bound, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
         for surface in np.unique(surface_of_point):
             near_separate_cells = is_near & are_separate[surface][surface_of_cell]
             nodes = np.unique(self._cells.nodes[near_separate_cells])
@@ -425,30 +458,32 @@ class ClosestPointSearch:
                 distance, _ = tree.query(
                     x[points_of_surface, :3], distance_upper_bound=max_distance
                 )
-                reach[points_of_surface] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
+                bound[points_of_surface] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
         is_bounded = are_separate[surface_of_cell[own_cells], surface_of_cell[faced_cells]]
-        return ProjectionLimits(is_bounded, reach)
+        return ProjectionLimits(is_bounded, bound)
 
     def projections_in_cells(
         self, points: ContactPoints, u: Array, r: Array, reach: float, *, least_only: bool = False
     ) -> Projections:
         """Return the nearest place in each near cell to each point, within a distance.
 
-        A point has one place for each cell near by; see `projections` for those that count.
+        A point has one place in each cell near by, also where the surface goes on from there to a
+        nearer place. `projections` leaves out such places.
 
         Parameters
         ----------
         points
             Contact points.
         u, r
-            (nodes, 3) displacement, and the result of `places_of_nodes` at it.
+            (nodes, 3) displacement, and (nodes, 3 or 4) the result of `places_of_nodes` at it.
         reach
-            Largest distance over R, see `projections`.
+            Largest distance over R: between mid-surfaces, or between faces plus h where r has a
+            fourth component.
         least_only
-            See `projections`.
+            Whether only each point's nearest place is needed; the result may have some others.
         """
         largest_offset = self._bound(r[:, 3]) if r.shape[1] > 3 else 0.0
-        # mid-surfaces may be farther apart than faces, by both offsets
+        # mid-surfaces may be farther apart than faces, by the offsets of both
         face_reach, reach = reach, reach + 2 * largest_offset
         i, j = self._near_pairs(u, reach)
         # contact points in the order of cells: those of cell i are
@@ -470,14 +505,25 @@ class ClosestPointSearch:
         limits = None
         if least_only:
             limits = self._limits(searched, x, r, (i, j), points.cell[searched], reach)
-        pairs = j, first_position, count, order  # cell j with the points of cell i
-        _, places = nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)
+        # for each pair the cell j with the points of cell i; the numbers of the pairs to which the
+        # places belong are not needed
+        pairs_with_points = j, first_position, count, order
+        _, places = nearest_places(
+            self._cells,
+            r,
+            x,
+            pairs_with_points,
+            reach,
+            max_distance=face_reach,
+            undeformed=undeformed,
+            limits=limits,
+        )
         return places
 
     def select_distant_cells(self, points: ContactPoints, places: Projections) -> Projections:
         """Return the places whose cells are not near the point's own cell within the surface.
 
-        Only such cells are cut along each other, see `Segments`.
+        Only such cells are cut along each other.
         """
         keys = points.cell[places.point] * len(self._cells.nodes) + places.cell
         return places.select(~self._are_near_in_surface(keys))
@@ -490,14 +536,15 @@ class ClosestPointSearch:
         (_, half_at_places), *_ = jets(self._cells.element, places.X, nodal, order=0)
         shape, own_cell = points.shape[places.point], points.cell[places.point]
         half_at_points = np.sum(shape * half[own_cell], axis=1)
+        # the mean of two thicknesses is the sum of their halves
         return np.asarray(half_at_points + half_at_places[:, 0])
 
     def _select_nearest(self, points: ContactPoints, places: Projections) -> Projections:
         """Return the places from which the surface goes on to no nearer place.
 
         A point has at most one such place in each direction: on both sides of its own surface, and
-        before its edge. Places at the same distance in neighbouring cells all stay, to be joined as
-        one by `JoinedPlaces`. The result is in the order of points, directions and distances.
+        before its edge. Places at the same distance in neighbouring cells all stay; they are joined
+        as one later on. The result is in the order of points, directions and distances.
         """
         # in the order of points, then of cells, so that a point's place in a cell can be looked up
         cell_count = len(self._cells.nodes)
@@ -511,14 +558,15 @@ class ClosestPointSearch:
         for side in range(3):
             neighbour = self._cells.neighbours[places.cell, side]
             is_on_side = on_sides[:, side] & (neighbour >= 0)
+            # whether the point has a place in the neighbour too, and that one is not nearer
             is_no_nearer_across = have_farther_places(
                 keys,
-                places.point * cell_count + neighbour,
-                places.distance,
-                DISTANCE_TOLERANCE * self._h,
+                other_keys=places.point * cell_count + neighbour,
+                distance=places.distance,
+                tolerance=DISTANCE_TOLERANCE * self._h,
             )
-            # or the surface is folded at the side: the neighbour is material around the point,
-            # which is not searched
+            # the place also counts if the surface is folded at the side: the neighbour is then the
+            # material around the point, in which no place is searched
             key_of_cells = points.cell[places.point] * cell_count + neighbour
             is_folded = places.is_above & self._are_near_in_surface(key_of_cells)
             is_nearest &= ~is_on_side | is_no_nearer_across | is_folded
@@ -527,7 +575,7 @@ class ClosestPointSearch:
             return places
         # in each direction the nearest place stays, with those at the same distance
         places = _number_directions(places.select(np.lexsort((places.distance, places.point))))
-        first = places.firsts
+        first = places.firsts  # row of the nearest place of each point and direction
         least_distance = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
         return places.select(places.distance < least_distance + DISTANCE_TOLERANCE * self._h)
 
@@ -543,29 +591,33 @@ class ClosestPointSearch:
 
         Parameters
         ----------
+        points
+            Contact points.
         places
-            In the order of points, directions and distances.
+            Their places, in the order of points, directions and distances.
         normals
-            (cells, 3) unit normals where the cuts were made.
+            (cells, 3) unit normals at the displacement where the cuts were made.
         """
-        first = places.firsts
+        first = places.firsts  # row of the nearest place of each point and direction
         nearest = places.select(first)
         is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
         is_left = is_on_edge & is_steep & ~points.is_on_edge[nearest.point]
         return np.asarray(np.repeat(is_left, np.diff([*first, len(places.point)])))
 
     def are_edges_alone(self, points: ContactPoints, nearest: Projections, normals: Array) -> Flags:
-        """Return flags (n,): which points belong to an edge that presses on a face alone.
+        """Return flags (n,): whose points belong to an edge that presses on a face alone.
 
-        Such a point faces the inside of a surface that is steep to its own. The own points of the
-        face do not count there, see `are_left_to_edges`.
+        Such a point faces the inside of a surface that is steep to its own. The points of that
+        surface do not count there, since an edge would catch at each of them as it slides.
 
         Parameters
         ----------
+        points
+            All contact points.
         nearest
-            The nearest place of each of n points.
+            n places, each the nearest of its point; the result is in their order.
         normals
-            (cells, 3) unit normals where the cuts were made.
+            (cells, 3) unit normals at the displacement where the cuts were made.
         """
         is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
         return np.asarray(is_steep & ~is_on_edge)
@@ -587,10 +639,11 @@ class ClosestPointSearch:
         """
         # (n, 3): a barycentric coordinate is zero on the side opposite to its corner
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
-        # one free direction: the second column of each matrix is zero, and the first is not
+        # places that move along a side have one free direction: the second column of each matrix
+        # is zero, and the first is not
         has_direction = nearest.free_directions.any(axis=(1, 2))
         has_no_second = (nearest.free_directions[:, :, 1] == 0).all(axis=1)
-        is_open = self._cells.neighbours[nearest.cell] < 0
+        is_open = self._cells.neighbours[nearest.cell] < 0  # (n, 3): no cell across the side
         is_on_edge = has_direction & has_no_second & (on_side & is_open).any(axis=1)
         # a place in a corner is on two sides, and on an edge if that corner is
         in_corner = on_side.sum(axis=1) == 2
@@ -641,8 +694,8 @@ def gap_between_supports(
 ) -> float:
     """Return the least gap over R between faces at supported nodes, where faces overlap.
 
-    Where they do it is negative; it is infinite if no faces overlap. Only pairs of nodes count that
-    are a thickness apart undeformed: the others are the same material.
+    It is negative where faces overlap, and infinite if none do. Only pairs of nodes count that are
+    at least a thickness apart undeformed: other pairs are the same material.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class ContactObservables(Observables):
     )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        """Return the names of the penalty's stiffness of all pairs in a state."""
+        """Return the names under which a state stores the penalty's stiffness of all pairs."""
         return tuple(pair.setting for pair in loads.pairs)
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -87,7 +87,7 @@ class ContactObservables(Observables):
                     )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of the columns of all pairs."""
+        """Return the names of the columns of all pairs; `supports` are not used here."""
         return tuple(column for pair in loads.pairs for column in _columns(pair))
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
@@ -98,7 +98,7 @@ class ContactObservables(Observables):
         model, values = view.model, dict[str, float]()
         for contact in model.shell_contacts:
             evaluation = model.system.at_state(state)
-            # the model evaluates both with this state as its present one
+            # both are functions of the present state, which is this one while they are evaluated
             force, gap = evaluation.evaluate(contact.force), evaluation.evaluate(contact.least_gap)
             # in the order of `quantities`
             numbers_of_pair = force / model.force_unit, gap / view.h, contact.stiffness.value

@@ -89,7 +89,10 @@ class Pair:
 
     @property
     def cuts(self) -> str:
-        """The name in a state of the number of its cuts, see `segments.Cuts`."""
+        """The name under which a state stores the number of its cuts.
+
+        Cuts divide cells along the cells that they face.
+        """
         return f"cuts between {self.names[0]} and {self.names[1]}"
 
     @property
@@ -106,15 +109,24 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     key = "contact"
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse pairs that the model of the case cannot have, see `refuse_unfit_pairs`."""
+        """Refuse pairs that the model of the case cannot have.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
         refuse_unfit_pairs(self.sections, context)
 
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the symmetry that contact preserves: all, but no meridian if a patch may touch."""
+        """Return the symmetry that contact preserves: all of it, unless a patch may touch.
+
+        A patch need not be the same all around an axis; then the case has no meridian model. The
+        outline is not used here.
+        """
         names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
-        # patches need not be the same all around an axis
         return [patch_constraint("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
@@ -144,7 +156,7 @@ def model_pairs(
     moduli
         Name of each of several shells -> Young's modulus over E; empty for one shell.
     """
-    # over E h/R^2: D/(R h)^2 is E h/R^2 over 12 (1 - nu^2)
+    # stiffnesses are over E h/R^2, and D/(R h)^2 is E h/R^2 over 12 (1 - nu^2)
     default_stiffness, pairs = RELATIVE_STIFFNESS / (12 * (1 - nu**2)), list[Pair]()
     for pair in sections:
         first, second = names_of(pair)
@@ -185,7 +197,8 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
     ValueError
         With the key and what is allowed.
     """
-    # pairs without the order of their members, and names of several shells if there are any
+    # earlier pairs as sets, since the order of their members does not matter; names of several
+    # shells, if there are any
     earlier_pairs, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
     for i, pair in enumerate(map(names_of, sections)):
         if frozenset(pair) in earlier_pairs:
@@ -194,7 +207,7 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
             )
         earlier_pairs.add(frozenset(pair))
         for name in pair:
-            # of several shells a name is that of one, or of a patch of one
+            # if there are several shells, a name is that of one of them, or of a patch of one
             is_shell = name in (WHOLE_SHELL, *shells)
             is_patch = name.startswith(tuple(f"{shell}_" for shell in shells))
             if shells and not is_shell and not is_patch:
@@ -206,7 +219,7 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
                     f"contact.{i}: {name}: allowed: {WHOLE_SHELL}; parts are the patches of a "
                     "mesh file"
                 )
-    # as a set of names, the pair of the whole shell and itself has one
+    # the pair of the whole shell and itself, whose set has one name, must be the only pair
     if len(earlier_pairs) > 1 and frozenset({WHOLE_SHELL}) in earlier_pairs:
         raise ValueError(f"contact: {WHOLE_SHELL} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface")

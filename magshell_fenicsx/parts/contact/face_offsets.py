@@ -1,18 +1,22 @@
 """Offsets of faces: how far they are from a mid-surface whose thickness varies or changes.
 
-It is half the thickness, continuous from cell to cell. At each node it is the undeformed volume per
-deformed area of the cells around, and between nodes their polynomial:
+The offset H is half the thickness, continuous from cell to cell. At node k it is the undeformed
+volume of the cells around, over their deformed area; between nodes it is the polynomial of these
+values:
 
     H_k = (h/2) sum V / sum A,   V = t J0,   A = J where the shell keeps its volume, else J0,
 
-with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has
-grown V is the natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by
-the displacement and by this amplitude are exact. docs/theory.md, Contact.
+with t h the undeformed thickness, J = |a_1 x a_2| of the cell at the node, and J0 this undeformed.
+Of a shell that has grown V is the natural volume, a polynomial of the amplitude "natural_stretch".
+The derivatives by the displacement and by this amplitude are exact. docs/theory.md, Contact.
 
-The offset H is half the thickness, and half volumes are (h/2) sum V. The thickness factor is t.
-Growth is the value of the amplitude. Places have a second meaning in shapes of arrays: (cells,
-places) are values of each cell at its nodes. The images of a half or a sector are copies of its
-nodes; copies at one place share one H. The unknowns of a node are its displacement.
+- Half volumes are (h/2) sum V at a node. The thickness factor is t. The growth is the value of the
+  amplitude.
+- In shapes of arrays (cells, places) are values of each cell at its own nodes, and dofs are the
+  3 * places components of its nodes.
+- The images of a half or a sector are copies of its nodes. Copies at one place share one H.
+- The unknowns of a node are its displacement.
+- `by_...` is a derivative by the thing that is named; the slope of J is that by all dofs.
 """
 
 from dataclasses import dataclass
@@ -75,8 +79,8 @@ class FaceOffsets:
     h
         Thickness over R.
     volume_factors
-        (powers, cells, functions) V over h J0 at the nodes of each cell, by powers of the
-        amplitude.
+        (powers, cells, functions) V over J0 at the nodes of each cell, by powers of the amplitude.
+        Without growth it is the thickness factor t.
     keeps_volume
         (cells,) whether the thickness follows from the area.
     same_place
@@ -89,10 +93,12 @@ class FaceOffsets:
     undeformed_half_thickness
         (nodes,) over R, before anything grows.
 
-    The field `_place_numbers` (cells, functions) has the node that stands for all copies at a
-    place. `_volume_coefficients` (powers, nodes) are (h/2) sum V at nodes by powers of the growth;
-    `_fixed_area` (nodes,) is the part of sum A that does not change. `_volume_per_factor` is h/2
-    times V over t J0 in each cell.
+    The field `_same_place` is the parameter `same_place`; `_place_numbers` (cells, functions) has
+    for each node of each cell the node that stands for all copies at its place. `_thinning_cells`
+    are the numbers of the cells that keep their volume. `_volume_coefficients` (powers, nodes) are
+    (h/2) sum V at nodes by powers of the growth; `_fixed_area` (nodes,) is the part of sum A that
+    does not change. `_thickness_factor` (cells, functions) is t. `_volume_per_factor` (powers,
+    cells, functions) is (h/2) V over t J0, by powers of the growth.
     """
 
     def __init__(
@@ -118,7 +124,7 @@ class FaceOffsets:
         self._thickness_factor = volume_factors[0]  # t: the power zero, without growth
         self._volume_per_factor = h / 2 * volume_factors / volume_factors[0]
         self._fixed_area = self._sum_at_nodes(~keeps_volume, J0[~keeps_volume])
-        # without growth: the power zero
+        # the volumes without growth, which are those of the power zero, over undeformed areas
         self.undeformed_half_thickness = np.asarray(
             self._volume_coefficients[0] / self._sum_at_nodes(all_cells, J0)
         )
@@ -138,7 +144,10 @@ class FaceOffsets:
         return np.asarray(self._half_volumes() / self._areas_at_nodes(u))
 
     def growth_derivative(self, u: Array, order: int = 1) -> Array:
-        """Return the derivative (nodes,) of H by the natural stretch, of some order, at u."""
+        """Return the derivative (nodes,) of H by the natural stretch, of some order, at u.
+
+        The areas do not depend on the stretch, so it is that of the half volumes over the areas.
+        """
         return np.asarray(self._half_volumes(order) / self._areas_at_nodes(u))
 
     def slope(self, u: Array, f: Array) -> Array:
@@ -148,7 +157,8 @@ class FaceOffsets:
         """
         if self.is_constant:
             return np.zeros_like(u)
-        return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(len(u), -1))
+        jacobian = self.jacobian(u, is_needed=f != 0)
+        return np.asarray((jacobian.T @ f).reshape(len(u), -1))
 
     def jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
         """Return the sparse derivative (nodes, 3 nodes) of H by the displacement u (nodes, 3).
@@ -172,22 +182,26 @@ class FaceOffsets:
         return self._half_volumes(), self._areas_at_nodes(u)
 
     def by_factor(self, by_volume: Array) -> Array:
-        """Return derivatives (cells, functions) by the thickness factor t in the cells.
+        """Return derivatives (cells, functions) of a function by t at the nodes of each cell.
+
+        t is the thickness factor, and V is proportional to it: so the result is the derivative by
+        (h/2) V, times (h/2) V/t.
 
         Parameters
         ----------
         by_volume
-            (nodes,) derivatives of the same function by the volumes (h/2) sum V at nodes.
+            (nodes,) derivatives of the function by the half volumes (h/2) sum V at nodes.
         """
         # copies of a node share its volume, so their derivatives are added
         by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[
             self._place_numbers
         ]
+        # (h/2) V over t J0 at the present growth
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         return np.asarray(by_place_volume * volume_per_factor * self._areas(self._r0, slice(None)))
 
     def by_area(self, by_volume: Array, by_area: Array) -> Array:
-        """Return derivatives (nodes, 3) by the undeformed places, through the undeformed areas J0.
+        """Return derivatives (nodes, 3) of a function by undeformed places, through the areas J0.
 
         J0 is in the volumes V, and in the areas A of cells that do not keep their volume. The
         deformed areas J also depend on the undeformed place, in the same way as on u: the caller
@@ -196,19 +210,20 @@ class FaceOffsets:
         Parameters
         ----------
         by_volume, by_area
-            (nodes,) derivatives of the same function by the volumes and the areas at nodes.
+            (nodes,) derivatives of the function by the half volumes and by the areas at nodes.
         """
         # (cells, functions): copies of a node share volume and area, so derivatives are added
         by_place_volume, by_place_area = (
             np.bincount(self._same_place, f, len(f))[self._place_numbers]
             for f in (by_volume, by_area)
         )
-        # by J0 of each cell: V is volume_per_factor times t J0, and A is J0 or does not have it
+        # derivatives by J0 of each cell: (h/2) V is volume_per_factor times t J0, and A is J0 where
+        # the cell does not keep its volume
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         by_J0 = by_place_volume * volume_per_factor * self._thickness_factor
         by_J0 += by_place_area * ~self._keeps_volume[:, None]
-        # by places, in the cells that have a part; without displacement the slopes of J are those
-        # of J0
+        # derivatives by places, in the cells where those by J0 are not zero; at the displacement
+        # zero J is J0
         loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
         forces = np.zeros(self._r0.size)
         by_place = np.einsum(
@@ -220,7 +235,8 @@ class FaceOffsets:
     def slope_by_growth(self, u: Array, f: Array) -> Array:
         """Return the gradient (nodes, 3) of sum f H_g by u, with H_g = dH/d(natural stretch).
 
-        The weights f are (nodes,), the displacement u (nodes, 3).
+        The weights f are (nodes,), the displacement u (nodes, 3). As H_g = V_g/A, the gradient is
+        the sum of -f V_g/A^2 A,u.
         """
         weight = -f * self._half_volumes(1) / self._areas_at_nodes(u) ** 2
         return np.asarray((self._area_jacobian(u, f != 0).T @ weight).reshape(len(u), -1))
@@ -234,7 +250,7 @@ class FaceOffsets:
         loaded_cells, areas = self._cells_around(f != 0), self._areas_at_nodes(u)
         area_jacobian = self._area_jacobian(u, f != 0)
         weight = -f * self._half_volumes() / areas**2
-        # the products A,u A,u
+        # the products A,u A,u with their factor f 2 V/A^3
         of_slopes = area_jacobian.T @ scipy.sparse.diags_array(-2 * weight / areas) @ area_jacobian
         # the Hessian of A: a block for each cell, where copies of a node have the sum of weights
         weight_of_places = np.bincount(self._same_place, weight, len(weight)).astype(float)
@@ -248,57 +264,64 @@ class FaceOffsets:
     def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
         """Return the entries of a second derivative by the displacement u alone.
 
-        The given entries are those of K, by places and by offsets H of nodes: two kinds of
-        unknowns. With the derivative T of both by u, the result is T^T K T plus the Hessian of
-        sum f H (the chain rule).
+        The given entries are those of K, the second derivative by places and by offsets H of
+        nodes: two kinds of unknowns. With the derivative T of both by u, the result is T^T K T plus
+        the Hessian of sum f H (the chain rule).
 
         Parameters
         ----------
         u
             (nodes, 3) displacement over R.
         entries
-            Rows, columns and values by places, then offsets; see `unknown_numbers`.
+            Rows, columns and values of K. The components of all places have the first numbers, then
+            come the offsets, one for each node.
         f
             (nodes,) the first derivative of the energy by H.
         """
         rows, columns, values = entries
-        count = self._components * len(f)
-        size = count + len(f)
+        place_count = self._components * len(f)
+        size = place_count + len(f)
         if self.is_constant:  # H does not depend on u: entries by places remain
-            is_of_places = (rows < count) & (columns < count)
+            is_of_places = (rows < place_count) & (columns < place_count)
             return rows[is_of_places], columns[is_of_places], values[is_of_places]
         # only offsets that have entries need a derivative
         has_entries = np.zeros(size, dtype=bool)
         has_entries[rows] = True
-        # T: places have the identity, offsets follow
+        # T: of places it is the identity, below which the rows of offsets follow
         T = scipy.sparse.vstack(
-            [scipy.sparse.eye_array(count), self.jacobian(u, has_entries[count:])]
+            [scipy.sparse.eye_array(place_count), self.jacobian(u, has_entries[place_count:])]
         ).tocsr()
         K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
         i, j, v = scipy.sparse.find(T.T @ K @ T + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
 
     def coupled_pairs(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
-        """Return the pairs of nodes whose displacements are coupled, for pairs by places and H.
+        """Return the pairs of nodes whose displacements are coupled in the tangent matrix.
 
-        H at a node depends on the displacement of all nodes of the cells around. So a coupling of
-        two nodes couples all nodes around the one with all nodes around the other.
+        H at a node depends on the displacement of all nodes of the cells around. So where places
+        and offsets of two nodes are coupled, the displacements of all nodes around the one are
+        coupled with those of all nodes around the other.
 
         Parameters
         ----------
         rows, columns
             Pairs (n,) of nodes whose places and offsets are coupled.
+
+        Returns
+        -------
+        rows, columns
+            Pairs (m,) of nodes whose displacements are coupled.
         """
         if self.is_constant:
             return rows, columns
         places, count = self._place_numbers, len(self._r0)
-        # sparse flags: which place a node has, and which places and nodes a cell has
+        # sparse flags: at which place a node is, and which places and nodes a cell has
         cell_rows = np.repeat(np.arange(len(places)), places.shape[1])
         has_place = _sparse_flags(np.arange(count), self._same_place, (count, count))
         cell_has_place = _sparse_flags(cell_rows, places.ravel(), (len(places), count))
         cell_has_node = _sparse_flags(cell_rows, self._cells.nodes.ravel(), (len(places), count))
-        # where products are not zero: (nodes, nodes), on whose displacement the place and H of each
-        # node depend, that is on its own and on those of nodes in the cells around
+        # (nodes, nodes), not zero where the place or H of the first node depends on the
+        # displacement of the second: that is itself, or a node of the cells around its place
         depends_on = scipy.sparse.eye_array(count) + has_place @ cell_has_place.T @ cell_has_node
         couplings = _sparse_flags(rows, columns, (count, count))
         i, j = (depends_on.T @ couplings @ depends_on).nonzero()
@@ -306,10 +329,9 @@ class FaceOffsets:
 
     def _half_volumes(self, order: int = 0) -> Array:
         """Return (h/2) sum V (nodes,), or its derivative of an order by the natural stretch."""
-        powers = np.polynomial.polynomial  # coefficients are in ascending powers of the growth
-        return np.asarray(
-            powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order))
-        )
+        powers = np.polynomial.polynomial  # NumPy's functions of ascending powers
+        coefficients = powers.polyder(self._volume_coefficients, order)
+        return np.asarray(powers.polyval(self.growth, coefficients))
 
     def _areas_at_nodes(self, u: Array) -> Array:
         """Return the sums of A (nodes,) over the cells around nodes, at u (nodes, 3)."""
@@ -341,10 +363,11 @@ class FaceOffsets:
     def _area_jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
         """Return sparse derivatives (nodes, 3 nodes) by u of the areas at nodes.
 
-        Rows of nodes that are not needed, by the flags (nodes,), may be missing terms.
+        Rows of nodes that are not needed, by the flags (nodes,), may lack terms.
         """
         cells = self._cells_around(is_needed)
         slope, places = self._area_slopes(u, cells), self._place_numbers[cells]
+        # (cells, places, dofs): the area at each place by all displacements of the cell
         rows, columns = np.broadcast_arrays(
             places[:, :, None], self._unknowns_of_cells(cells)[:, None, :]
         )
@@ -356,10 +379,11 @@ class FaceOffsets:
     def _unknowns_of_cells(self, cells: Longs) -> Longs:
         """Return numbers (n, dofs) of the displacement's unknowns in n cells."""
         return unknown_numbers(
-            self._cells.nodes[cells], len(self._r0), self._components, self._components
+            self._cells.nodes[cells],
+            count=len(self._r0),
+            components=self._components,
+            dim=self._components,
         )
-
-    # of surfaces
 
     @cached_property
     def _slope_table(self) -> Array:
@@ -391,7 +415,8 @@ class FaceOffsets:
         # a,u . a,u and J,u J,u: sums over the places q of a cell, by its unknowns m and n
         H = np.einsum("cqmi,cqni->cmn", by_node * (w / vectors.J)[..., None, None], by_node)
         H -= np.einsum("cqm,cqn->cmn", slope * (w / vectors.J)[..., None], slope)
-        # n . a,uu: the second derivative of a by components i and j of two nodes is along e_k
+        # n . a,uu: the second derivative of a by component i of node m and component j of node n is
+        # along e_k, with the factor N_m,1 N_n,2 - N_n,1 N_m,2 of shape functions
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # even permutations
             twist = np.einsum("cq,qm,qn->cmn", w * vectors.normal[..., k], *self._slope_table)
             twist -= np.swapaxes(twist, 1, 2)
@@ -421,10 +446,11 @@ def _sparse_flags(rows: Longs, columns: Longs, shape: tuple[int, int]) -> Any:
 
 
 def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3) -> Longs:
-    """Return the numbers (n, components functions) of the unknowns at nodes (n, functions).
+    """Return the numbers (n, components * functions) of the unknowns at nodes (n, functions).
 
-    The components of places come first, `dim` for each of `count` nodes. The offsets H come after
-    all of them, one for each node, if `components` is dim + 1.
+    In the numbering of all unknowns the components of places come first, `dim` for each of `count`
+    nodes. The offsets H come after all of them, one for each node. The result has the offsets if
+    `components` is dim + 1.
     """
     of_place = dim * nodes[:, :, None] + np.arange(dim)
     of_offset = dim * count + nodes[:, :, None]

@@ -1,19 +1,24 @@
 """Derivatives of a contact's energy by the growth of its faces, the thickness and the placement.
 
-The gap depends on half the thickness H at nodes, H = V/A with V = (h/2) sum t J0 of the cells
-around (see `face_offsets`), and on the places r0 + u; the energy is a sum over points with the
-weights J0(X). So of e Pi + f w . Pi,u the derivative is
+The gap depends on the places r0 + u, and on half the thickness H at nodes: H = V/A, where V =
+(h/2) sum t J0 and A = sum J are summed over the cells around the node. J0 and J are the undeformed
+and the deformed area of a cell at the node, per area of its coordinates. The contact energy Pi is a
+sum over points with the weights J0(X). The weighted sum of a functional is e Pi + f w . Pi,u, with
+two numbers e and f and a displacement w (`EnergyWeights`). Its derivative is
 
     by t:  (h/2) J0 g_V,    g_V = g/A + f Pi,H (H,u w)/V,    g = e Pi,H + f (Pi,Hu w + Pi,HH H,u w),
 
-and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay
-in their cells.
+and by r0 it is that by u, with what the weights and the undeformed areas in V and A add. The points
+stay in their cells.
 
-Here t is the factor of the thickness, J0 the undeformed area at a node, w a displacement, and e and
-f are the two weights (`EnergyWeights`). Growth is the natural stretch, an amplitude on which the
-thickness of a grown shell depends. Forces are derivatives of the energy by places and by H;
-rates are derivatives along a motion. A place is the closest place that a point faces; joined places
-count as one. beta are shape functions of a point and minus those of its place.
+- t is the factor of the thickness.
+- Growth is the natural stretch, an amplitude on which the thickness of a grown shell depends.
+- Forces are derivatives of the energy by places, or by H as the last component; rates are
+  derivatives along a motion.
+- A place is the closest place that a point faces: `place.point` is the number of that point.
+  Several places of a point in neighbouring cells are joined, and count as one: `group` has the
+  joined place of each place, `first` the row of the first place of each joined place.
+- beta are the shape functions of a point, and minus those of its place.
 """
 
 from collections.abc import Callable, Sequence
@@ -97,7 +102,8 @@ class ContactState:
     find_entries_by_place_and_offset, find_entries
         Return entries of the second derivative by places and H, and by u.
     geometry
-        Returns distances, normals, and beta with its nodes, for places; see `gap_geometry`.
+        Returns for n places the distances (n,), the normals (n, 3), beta (n, functions of both
+        cells), and the numbers of the nodes of these functions.
 
     On a meridian vectors have two components in place of three.
     """
@@ -134,17 +140,24 @@ class ContactState:
         return np.column_stack([by_place.reshape(self.r0.shape), by_offset])
 
     def unknown_rates(self, w: Array) -> Array:
-        """Return the rates (nodes, 3 or 4) of places and H along a motion w (nodes, 3)."""
+        """Return the rates (nodes, 3 or 4) of places and H along a motion w (nodes, 3).
+
+        H is left out where the thickness is uniform.
+        """
         return np.column_stack([w, self.offsets.change(self.u, w)]) if self.offsets else w
 
     def forces_on_nodes(self, forces: Array) -> Array:
-        """Return the forces by u, see `gap_derivatives.forces_on_nodes`."""
+        """Return the derivatives (nodes, 3) by u, from those by places and H (nodes, 3 or 4).
+
+        H depends on u, so they are those by places, and those by H times H,u.
+        """
         return forces_on_nodes(self.offsets, self.u, forces)
 
     def weight_slopes(self, tables: Array, places: Array) -> Array:
-        """Return derivatives (n, functions, 3) of the logarithm of the points' weights by nodes.
+        """Return relative derivatives (n, functions, 3) of points' weights by undeformed nodes.
 
-        A weight is proportional to the undeformed area J0 = |a_1 x a_2|.
+        They are the derivatives of a weight over the weight. A weight is proportional to the
+        undeformed area J0 = |a_1 x a_2|.
 
         Parameters
         ----------
@@ -154,18 +167,21 @@ class ContactState:
             (3, n, 3) the undeformed places, and their derivatives a_1 and a_2.
         """
         _, a1, a2 = places
+        _, first_slopes, second_slopes = tables
         area_vector = np.cross(a1, a2)
         n = area_vector / np.sum(area_vector * area_vector, axis=1)[:, None]  # the normal over J0
         # relative derivatives of J0 by a_1 and by a_2
         by_first = np.cross(a2, n)[:, None]
         by_second = np.cross(n, a1)[:, None]
-        return np.asarray(tables[1][..., None] * by_first + tables[2][..., None] * by_second)
+        return np.asarray(first_slopes[..., None] * by_first + second_slopes[..., None] * by_second)
 
     def penetration_rates(self, w: Array) -> Array:
         """Return the rates (m,) of the joined places' penetrations along a motion w (nodes, 3)."""
         _, n, beta, nodes = self.geometry(self.places)
         rates = self.unknown_rates(w)
-        slopes = distance_slopes(n, beta, rates.shape[1])
+        # derivatives of the places' distances by places and H of nodes, times the rates of these;
+        # a penetration grows as the distance decreases
+        slopes = distance_slopes(n, beta, components=rates.shape[1])
         closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
         joined_places = self.joined_places
         # the distance of a joined place changes by the weighted mean of its places' changes
@@ -184,11 +200,14 @@ class GrowthDerivative:
     find_state
         Returns the contact at the present state; collective.
     add
-        Adds forces (nodes, 3) to a vector; collective.
+        Adds forces (nodes, 3) to a vector, its first argument; collective.
     order
         Order of the derivative, 1 or 2.
     amplitude
         The amplitude that multiplies it; None without.
+
+    In the methods Pi,H are the derivatives of the contact energy by H at nodes, and H,g and H,gg
+    are those of H by the natural stretch g.
     """
 
     find_state: Callable[[], ContactState]
@@ -203,10 +222,12 @@ class GrowthDerivative:
         """
         state = self.find_state()
         offsets, u = state.required_offsets, state.u
-        of_forces = 0.0  # H,g Pi,HH H,g
+        by_H = state.forces[:, -1]  # Pi,H, the last component of forces
+        curvature_part = 0.0  # H,g Pi,HH H,g
         if self.order == 2:
-            of_forces = float(_growth_forces(state)[:, -1] @ offsets.growth_derivative(u))
-        return of_forces + float(state.forces[:, -1] @ offsets.growth_derivative(u, self.order))
+            by_H_and_growth = _growth_forces(state)[:, -1]  # Pi,HH H,g
+            curvature_part = float(by_H_and_growth @ offsets.growth_derivative(u))
+        return curvature_part + float(by_H @ offsets.growth_derivative(u, self.order))
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add `factor` times the gradient by u of the energy's first derivative to b; collective.
@@ -214,7 +235,9 @@ class GrowthDerivative:
         The first derivative by the stretch g is Pi,H H,g: both factors depend on u.
         """
         state = self.find_state()
+        # the factor Pi,H varies: its derivative by u, times H,g
         forces = state.forces_on_nodes(_growth_forces(state))
+        # the factor H,g varies: its derivative by u, times Pi,H
         forces = forces + state.required_offsets.slope_by_growth(state.u, state.forces[:, -1])
         self.add(b, factor * forces)
 
@@ -231,9 +254,12 @@ def with_growth(
     Parameters
     ----------
     growth
-        The natural stretch as a free parameter, a number in the energies.
-    find_state, add
-        See `GrowthDerivative`.
+        The natural stretch as a free parameter. Its `slopes` are the terms of the energy's first
+        derivative; `differentiate_slopes` gives their derivatives by a second number.
+    find_state
+        Returns the contact at the present state; collective.
+    add
+        Adds forces (nodes, 3) to a vector, its first argument; collective.
     """
 
     def second_derivatives(q: object) -> Sequence[Derivative]:
@@ -246,14 +272,17 @@ def with_growth(
 
 
 def _growth_forces(state: ContactState) -> Array:
-    """Return the rates of the forces (nodes, 4) by the natural stretch, at fixed displacement."""
+    """Return the rates of the forces (nodes, 4) by the natural stretch, at fixed displacement.
+
+    They are Pi,rH H,g by places r, and Pi,HH H,g by H in the last component.
+    """
     rates = state.required_offsets.growth_derivative(state.u)
     return state.force_rates(np.column_stack([0 * state.u, rates]))
 
 
 @dataclass(frozen=True)
 class EnergyWeights:
-    """Weights of the sum `energy` Pi + `force` w . Pi,u, with w (nodes, 3)."""
+    """Weights of the sum e Pi + f w . Pi,u: e is `energy`, f is `force`, and w is (nodes, 3)."""
 
     w: Array
     energy: float
@@ -261,8 +290,11 @@ class EnergyWeights:
 
 
 def by_factor(state: ContactState, weights: EnergyWeights) -> Array:
-    """Return derivatives (cells, functions) of the weighted sum by the thickness factor."""
-    by_volume, _ = _by_volumes(state, weights)
+    """Return derivatives (cells, functions) of the weighted sum by the thickness factor.
+
+    The thickness factor is only in the volumes V; the areas do not depend on it.
+    """
+    by_volume, _ = _by_volumes_and_areas(state, weights)
     return state.required_offsets.by_factor(by_volume)
 
 
@@ -276,10 +308,13 @@ def by_place(state: ContactState, weights: EnergyWeights) -> Array:
     rates = np.bincount(rows, values * weights.w.ravel()[columns], state.r0.size)
     forces = weights.energy * state.forces_on_nodes(state.forces)
     forces = forces + weights.force * rates.reshape(state.r0.shape) + _by_weights(state, weights)
-    return forces + state.offsets.by_area(*_by_volumes(state, weights)) if state.offsets else forces
+    if not state.offsets:  # a uniform thickness depends on no area
+        return forces
+    by_volume, by_area = _by_volumes_and_areas(state, weights)
+    return forces + state.offsets.by_area(by_volume, by_area)
 
 
-def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Array]:
+def _by_volumes_and_areas(state: ContactState, weights: EnergyWeights) -> tuple[Array, Array]:
     """Return derivatives (nodes,) of the weighted sum by the volumes V and by the areas A.
 
     By V they are g_V of the module's formula. As H = V/A and H,u w = -V A,u w/A^2, those by A are
@@ -290,8 +325,8 @@ def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Arr
     force_rates = state.force_rates(np.column_stack([weights.w, H_w]))
     g = weights.energy * state.forces[:, -1] + weights.force * force_rates[:, -1]
     volume, area = state.required_offsets.volumes_and_areas(state.u)
-    by_H_w = weights.force * state.forces[:, -1] * H_w
-    return g / area + by_H_w / volume, -(g * volume / area + 2 * by_H_w) / area
+    along_w = weights.force * state.forces[:, -1] * H_w  # f Pi,H (H,u w)
+    return g / area + along_w / volume, -(g * volume / area + 2 * along_w) / area
 
 
 def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
@@ -303,16 +338,17 @@ def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
     if not len(state.places.point):
         return forces
     value, pressure, _ = state.penalties
+    # the number of the contact point of each joined place
     points, point = state.points, state.places.point[state.joined_places.first]
     # the weighted sum per area: along w the penalty changes by the pressure times the rate of the
-    # penetration; half, since both surfaces have points
+    # penetration. It is halved, since both surfaces have points
     rates = state.penetration_rates(weights.w)
     value_of_joined = (weights.energy * value + weights.force * pressure * rates) / 2
     per_weight = np.bincount(point, value_of_joined, len(points.cell))
     # relative derivatives of the weights of points in contact, times their part of the sum
     pressed_points = np.unique(point)
     element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed_points]]
-    X = points.shape[pressed_points] @ element.points  # in the reference cell
+    X = points.shape[pressed_points] @ element.points  # places in the reference cell
     tables = element.tabulate(1, X)[..., 0]
     undeformed_places = np.einsum("dnk,nki->dni", tables, state.r0[nodes])
     slopes = state.weight_slopes(tables, undeformed_places)

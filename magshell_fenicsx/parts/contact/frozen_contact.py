@@ -1,15 +1,19 @@
 """A contact with its active set fixed, for differences by a number of the case.
 
-What is pressed stays what it is at one state: the points, the cells that they face, whether places
-are inside of these or on a side, and which places are joined as one. In those cells the places move
-on. The penalty is its Taylor polynomial about the penetration of that state, since its stiffness
-grows from zero within a far smaller way than that of a difference; the weights of joined places are
-linear. So energies and forces are smooth in the number, with the exact first derivative.
+The active set of a contact has the places that are pressed. It stays as it is at one state, the
+frozen state: the contact points, the cells that they face, whether places are inside these cells or
+on a side, and which places are joined as one. Within their cells the places still move. The penalty
+is replaced by its Taylor polynomial about the penetration of the frozen state: its stiffness grows
+from zero over a penetration far smaller than the motion between the two states of a difference. The
+weights of joined places are linear in distances. So energies and forces are smooth in the number,
+with the exact first derivative.
 
-A place is the closest place to a contact point, in coordinates X of a cell. Joined places are those
-of one point in neighbouring cells, which count as one with a smooth minimum of their distances; its
-blur is a small length. The active set has the places in contact. r0 and u are undeformed places and
-displacements of nodes. Lengths are over R, stiffnesses over E h/R^2.
+A place is the closest place to a contact point, in coordinates X of a cell; `point` has the number
+of its contact point. Joined places are those of one point in neighbouring cells. They count as one
+place, whose distance is a smooth minimum of their distances d: -e log sum exp(-d/e), where the blur
+e is a small length. `group` has the joined place of each place, `first` the first place of each
+joined place. r0 and u are undeformed places and displacements of nodes. Lengths are over R,
+stiffnesses over E h/R^2.
 """
 
 from dataclasses import dataclass, replace
@@ -87,18 +91,24 @@ class FrozenContact:
     ) -> tuple[Projections, JoinedPlaces, Penalty]:
         """Return the places at a displacement, how they are joined, and the expanded penalty.
 
-        The penalty (m,) of joined places has its two derivatives, see `expanded_penalty`.
-
         Parameters
         ----------
         search
-            Gives the places of nodes and points; it is not searched.
+            Gives the places of nodes and points. No new closest points are searched.
         u
             (nodes, 3) displacement over R.
         k, h
             Stiffness of the penalty over E h/R^2, and thickness over R.
         with_third_order
             Whether the penalty is expanded to third order, as differences of tangents need.
+
+        Returns
+        -------
+        places, joined_places
+            The n places, and which of them are joined as m places.
+        penalty
+            Three arrays (m,): the penalty energy per area of each joined place, with its first and
+            second derivative by the penetration.
         """
         places, joined_places, cells = self.places, self.joined_places, self.cells
         soft_penetration = SOFT_PENETRATION * h
@@ -109,7 +119,7 @@ class FrozenContact:
         x = search.places_of_points(self.points, r, places.point)
         nodal = r[cells.nodes[places.cell]]
         X = follow_places(cells, x, nodal, places.X, places.free_directions)
-        (_, y), *_ = jets(cells.element, X, nodal, 0)
+        (_, y), *_ = jets(cells.element, X, nodal, order=0)  # the places y at X, no derivatives
         off, distance = (x - y)[:, :3], distances(x - y)
         direction = off / np.linalg.norm(off, axis=1)[:, None]
         moved_places = replace(places, X=X, distance=distance, direction=direction)
@@ -136,7 +146,7 @@ class FrozenContact:
 
 
 def _area_ratio(cells: Cells, r0: Array, points: ContactPoints) -> Array:
-    """Return the undeformed area (points,) per area of the reference cell.
+    """Return the undeformed area at contact points, (points,), per area of the reference cell.
 
     The undeformed surface has the places r0 (nodes, 3).
     """

@@ -2,10 +2,15 @@
 
 The unknowns of a node are its place (dim = 2 or 3 components), and the offset H, half the
 thickness, where that varies. A place of `Projections` is the closest place y of the other surface
-to a point x. beta are the shape functions of x, minus those of y. The distance of mid-surfaces is
-d, its direction n. The second derivative is, see `surface_contact`,
+to a contact point x, in a cell with the shape functions N_y; y_a are its derivatives by the two
+coordinates of the cell. beta are the shape functions of x, then minus those of y: so x - y is the
+sum of beta times the nodes' places. The distance of mid-surfaces is d, its direction n. The second
+derivative of d by the nodes' unknowns is
 
-    d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a).
+    d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a),
+
+where A is the Hessian of d^2/2 by the coordinates of y. Joined places are places of one point in
+neighbouring cells that count as one.
 """
 
 from collections.abc import Sequence
@@ -54,7 +59,8 @@ def gap_geometry(
     nodes = np.concatenate([own_nodes, cells.nodes[places.cell]], axis=1)
     # the first half of a row's nodes belongs to the point, the second to the place
     half, shape_of_points = nodes.shape[1] // 2, points.shape[places.point]
-    (shape_of_places, y), *_ = jets(cells.element, places.X, r[nodes[:, half:]], 0)
+    # shape functions at the places, and the places y; no derivatives
+    (shape_of_places, y), *_ = jets(cells.element, places.X, r[nodes[:, half:]], order=0)
     off = np.einsum("nk,nki->ni", shape_of_points, r[nodes[:, :half]]) - y
     d = np.linalg.norm(off, axis=1)
     return d, off / d[:, None], np.concatenate([shape_of_points, -shape_of_places], axis=1), nodes
@@ -66,7 +72,7 @@ def distance_slopes(n: Array, beta: Array, components: int) -> Array:
     Parameters
     ----------
     n, beta
-        Normals (n, dim), and beta (n, functions of both cells), see `gap_geometry`.
+        Normals (n, dim) from places to points, and beta (n, functions of both cells).
     components
         Unknowns of a node: dim, or dim + 1 with the offset H as the last one. The derivative by H
         is -1 times the shape function, of the point and of the place.
@@ -93,21 +99,24 @@ def gap_hessians(
 
     Parameters
     ----------
+    places
+        n closest places y of contact points.
     geometry
-        Distances, normals, beta and its nodes, see `gap_geometry`.
+        Distances, normals, beta, and the numbers of its nodes: the result of `gap_geometry`.
     r
-        (nodes, components) of all nodes, see `distance_slopes`.
+        (nodes, components) places of all nodes; with the offset H as the last component where the
+        thickness varies.
     penalties
         (n,) weights, and first and second derivatives of the penalty by the penetration.
     """
     (d, n, beta, nodes), (weight, first, second) = geometry, penalties
     half, components = nodes.shape[1] // 2, r.shape[1]  # the second half belongs to the place
-    # shape functions at the places with their derivatives, and y with its derivatives
+    # shape functions at the places, and the places y, each with first and second derivatives
     shapes, place_jets = zip(*jets(cells.element, places.X, r[nodes[:, half:]]), strict=True)
-    # n and d n, with a fourth component for H: 0 of n, and d of d n
+    # n and d n; where H is an unknown, with one more component: 0 of n, and d of d n
     normal = np.column_stack([n, 0 * d])[:, None, :components]
     off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :components]
-    _, A = slopes(off[:, 0], *place_jets[1:])  # the Hessian of d^2/2 by the place
+    _, A = slopes(off[:, 0], *place_jets[1:])  # the Hessian of d^2/2 by the coordinates of y
     free_directions = places.free_directions
     # the inverse of A in the directions in which the place can move
     M = np.einsum(
@@ -148,7 +157,7 @@ def _place_motion(
     Parameters
     ----------
     beta
-        (n, functions of both cells), see `gap_geometry`.
+        (n, functions of both cells) shape functions of the points, then minus those of the places.
     normal, off
         (n, 1, components) n and d n, with 0 and d in the fourth component.
     shape_slopes, tangents
@@ -169,9 +178,10 @@ def _place_motion(
 def joint_entries(
     slopes_of_places: Array, nodes: Longs, group: Longs, weight: Array, count: int
 ) -> Entries:
-    """Return the tangent's entries that joined places have besides those of each place.
+    """Return the tangent's entries of joined places that come on top of those of each place.
 
-    They are the products D,u D,u of derivatives of the joined distances D, times `weight`.
+    They are the products D,u D,u of derivatives of the joined distances D, times `weight`. The
+    entries are row numbers, column numbers and values.
 
     Parameters
     ----------
@@ -188,7 +198,7 @@ def joint_entries(
     """
     components = slopes_of_places.shape[2]
     dofs = unknown_numbers(nodes, count, components)
-    # derivatives D,u (m, all unknowns) of the joined distances: sums over their places
+    # G: derivatives D,u (m, all unknowns) of the joined distances, sums over their places
     rows = np.repeat(group, dofs.shape[1])
     entries = slopes_of_places.ravel(), (rows, dofs.ravel())
     G = scipy.sparse.coo_array(entries, (len(weight), components * count)).tocsr()

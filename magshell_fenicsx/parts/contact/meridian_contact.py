@@ -166,10 +166,17 @@ class MeridianContact(ContactTerm):
     sides
         (cells,) flags of the cells of the first shell, and of the second.
 
-    Private fields keep the last active set: `_at` is its displacement, `_growth` the natural
-    stretch there, and `_places` are its places. `_frozen` is a frozen contact that replaces the
-    search. `_half` is half the undeformed thickness at nodes, `_reach` the largest distance that is
-    looked for. `_material` is the material around points of a shell that may touch itself.
+    Private fields of the model: `_curves` are the meridians, `_nodes` (cells, functions) the nodes
+    of cells, `_r0` (nodes, 2) undeformed places, `_h` the thickness, and `_half` (nodes,) half the
+    undeformed thickness. `_nodes_of_pair` are the numbers of the nodes of both members. `_points`
+    are the quadrature points, `_normals` (cells, 2) undeformed normals of cells. `_candidates`
+    finds the cells near points, up to the distance `_reach`. `_material` is the material around
+    points of a shell that may touch itself; None for two shells. `_meridian_offsets` is half the
+    thickness where it varies, else None.
+
+    Private fields of the last active set: `_at` is its displacement, `_growth` the natural stretch
+    there, and `_places` are its places. `_active_sets` is a cache of such sets. `_frozen` is a
+    frozen contact that replaces the search: its places, and their penetrations.
     """
 
     def __init__(self, pair: Pair, model: ModelMeridian, sides: tuple[Flags, Flags]) -> None:
@@ -210,7 +217,9 @@ class MeridianContact(ContactTerm):
     def energy(self) -> float:
         """Return the energy of the whole shell over E h R^2."""
         places = self._active_set()
-        return float(self._points.weight[places.point] @ self._penalty(places)[0]) / 2
+        energy_per_area, _, _ = self._penalty(places)
+        # half, since the points of the other curve have the same contact
+        return float(self._points.weight[places.point] @ energy_per_area) / 2
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 2) to the vector b; every rank has all nodes."""
@@ -222,12 +231,14 @@ class MeridianContact(ContactTerm):
         Where the thickness varies, the third component is the derivative by the offset H.
         """
         places = self._active_set()
+        _, pressure, _ = self._penalty(places)
         # half, since the points of the other curve have the same contact
-        weight = self._points.weight[places.point] / 2 * self._penalty(places)[1]
+        force_of_places = self._points.weight[places.point] / 2 * pressure
+        # derivatives of the distances by the unknowns of the nodes of both cells
         _, n, beta, nodes = self._geometry(places)
         forces = np.zeros((len(self._r0), 3 if self._offsets else 2))
-        by_unknowns = distance_slopes(n, beta, forces.shape[1])
-        np.add.at(forces, nodes, -weight[:, None, None] * by_unknowns)
+        by_unknowns = distance_slopes(n, beta, components=forces.shape[1])
+        np.add.at(forces, nodes, -force_of_places[:, None, None] * by_unknowns)
         return forces
 
     def _entries_by_place_and_offset(self) -> Entries:
@@ -240,7 +251,10 @@ class MeridianContact(ContactTerm):
         entries = self._entries_by_place_and_offset()
         if not self._offsets:
             return entries
-        return self._offsets.entries(self._at, entries, self._forces()[:, -1])
+        # offsets depend on the displacement: by the chain rule, which needs the derivative of the
+        # energy by offsets, the entries become those by the displacement alone
+        by_offset = self._forces()[:, -1]
+        return self._offsets.entries(self._at, entries, by_offset)
 
     def _block_entries(self, H: Array, nodes: Longs, of_place: list[int]) -> Entries:
         """Return the entries of blocks by some components of nodes, and by H where it varies.
@@ -251,25 +265,36 @@ class MeridianContact(ContactTerm):
             (n, dofs, dofs) blocks of second derivatives by (U, V, W, H), and their nodes (n,
             functions).
         of_place
-            Components among (U, V, W) that are unknowns: numbers 0, 1 and 2.
+            Which of U, V and W are unknowns, as numbers 0, 1 and 2: [0, 2] for U and W.
         """
         # the fourth unknown of a node, number 3, is the offset H
         components = [*of_place, 3] if self._offsets else of_place
         rows_of_block = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, components))
-        dofs = unknown_numbers(nodes, len(self._r0), len(components), len(of_place))
+        # global numbers of these unknowns (n, rows of a block): those of places come first
+        dofs = unknown_numbers(
+            nodes, count=len(self._r0), components=len(components), dim=len(of_place)
+        )
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None])
         values = H[:, rows_of_block[:, None], rows_of_block]
         return rows.ravel(), columns.ravel(), values.ravel()
 
     @property
     def pattern_key(self) -> float:
-        """A number that identifies the pairs of cells in contact, see `NonlocalTerm`."""
+        """A number that identifies the pairs of cells in contact.
+
+        The sparsity pattern of the tangent is made again where it changes.
+        """
         return float(crc32(self._cells_in_contact().tobytes()))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """Return pairs of nodes of cells in contact, see `NonlocalTerm`."""
+        """Return pairs of nodes of cells in contact: the tangent may have entries between them."""
+        # the nodes of both cells, and each of them with each
         nodes = np.concatenate([self._nodes[cells] for cells in self._cells_in_contact().T], axis=1)
-        return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
+        rows, columns = pairs_of(nodes)
+        if not self._offsets:
+            return rows, columns
+        # an offset depends on the nodes of all cells around it, which are then coupled too
+        return self._offsets.coupled_pairs(rows, columns)
 
     def _cells_in_contact(self) -> Longs:
         """Return the pairs (n, 2) of cells in contact: cell of the point, cell of the place.
@@ -291,11 +316,13 @@ class MeridianContact(ContactTerm):
         blocks, nodes = self._second_derivative(m)
         rows, columns, values = self._block_entries(blocks, nodes, of_place=[0, 1, 2])
         if self._meridian_offsets:
+            # by the chain rule: entries by (U, V, W) and offsets become those by (U, V, W) alone
             offsets, by_offset = self._meridian_offsets.waves(m), self._forces()[:, -1]
             rows, columns, values = offsets.entries(self._at, (rows, columns, values), by_offset)
         # from (U, V, W) to (P, V, W) with P = U + V. The derivative by V at fixed P is that by V
         # less that by U: each entry of U stays as one of P, and is subtracted from V, the next
-        # unknown. Each round does so for the columns, and exchanges them with the rows
+        # unknown. The first round does so for the columns, and exchanges them with the rows. The
+        # second does so for the rows, and exchanges both back
         for _ in range(2):
             is_U = columns % 3 == 0
             values = np.concatenate([values, -values[is_U]])
@@ -325,7 +352,7 @@ class MeridianContact(ContactTerm):
         -------
         field, values
             The field and derivatives (cells, functions, components) by its values; None for any
-            other name. See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+            other name, and for a thickness that does not vary.
         """
         field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
         if field is None:
@@ -333,13 +360,16 @@ class MeridianContact(ContactTerm):
         w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
         state, weights = self._state(), EnergyWeights(w, energy, force)
         if name == "thickness":
-            return field, by_factor(state, weights)[..., None]
+            return field, by_factor(state, weights)[..., None]  # by the factor of the thickness
+        # derivatives (nodes, 2) by undeformed places; each node's derivative is shared out among
+        # the cells that have the node
         return field, self._fields.shared_by_cells(by_place(state, weights))
 
     def _state(self) -> ContactState:
         """Return the contact at the present state, for derivatives by fields.
 
-        On a meridian each place stands alone: joined places have one place each.
+        `ContactState` is made for surfaces, where several places of a point may be joined as one.
+        On a meridian each place stands alone: each joined place has one place, with the weight 1.
         """
         places = self._active_set()
         numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
@@ -366,14 +396,17 @@ class MeridianContact(ContactTerm):
     def force(self) -> float:
         """Return the integral of the contact pressure, over E h R, at the present state."""
         places = self._active_set()
+        _, pressure, _ = self._penalty(places)
         # half, since the points of both curves have the same force
-        return float(self._points.weight[places.point] @ self._penalty(places)[1]) / 2
+        return float(self._points.weight[places.point] @ pressure) / 2
 
     def least_gap(self) -> float:
         """Return the least gap over R at present; nan where no faces are within the reach."""
         u = self._displacement()
         reach = self._reach
-        if not self._material:  # between two shells no nearest place is farther than the nodes
+        if not self._material:
+            # the least distance of two shells is at most that of points from nodes, which costs
+            # less to compute: a search up to this distance is enough
             reach = min(reach, self._distance_to_nodes(u) * (1 + DISTANCE_TOLERANCE))
         least_distance = self._projections(u, reach).distance.min(initial=np.inf)
         return float(least_distance - self._h) if np.isfinite(least_distance) else np.nan
@@ -403,11 +436,13 @@ class MeridianContact(ContactTerm):
         The thickness is the mean of those at the point and at its place.
         """
         places, half = self._active_set(), self._half[self._nodes]
+        # half the thickness at points and at places: their sum is the mean thickness
         shape, own_cell = self._points.shape[places.point], self._points.cell[places.point]
-        at_points = np.sum(shape * half[own_cell], axis=1)
-        at_places = np.sum(self._curves.table(0, places.X)[0] * half[places.cell], axis=1)
+        half_at_points = np.sum(shape * half[own_cell], axis=1)
+        shape_at_places = self._curves.table(0, places.X)[0]
+        half_at_places = np.sum(shape_at_places * half[places.cell], axis=1)
         penetration = self._h - places.distance
-        return float((penetration / (at_points + at_places)).max(initial=0.0))
+        return float((penetration / (half_at_points + half_at_places)).max(initial=0.0))
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R at nodes that supports hold, where faces overlap.
@@ -417,17 +452,17 @@ class MeridianContact(ContactTerm):
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
-        first, second = self._sides
-
-        def may_touch(i: Longs, j: Longs) -> Flags:
-            is_pair = (first[i] & second[j]) | (second[i] & first[j])
-            if self._material:  # of one shell: not the same material
-                is_pair = is_pair & ~self._material.are_near(i, j)
-            return np.asarray(is_pair)
-
         return gap_between_supports(
-            supported_nodes, self._nodes, self._r0, u, self._half, may_touch
+            supported_nodes, self._nodes, self._r0, u, self._half, self._may_touch
         )
+
+    def _may_touch(self, cell: Longs, other: Longs) -> Flags:
+        """Return flags (n,): whether cells (n,) may touch the other cells (n,)."""
+        first, second = self._sides
+        is_pair = (first[cell] & second[other]) | (second[cell] & first[other])
+        if self._material:  # of one shell: not the same material
+            is_pair = is_pair & ~self._material.are_near(cell, other)
+        return np.asarray(is_pair)
 
     def refuse_overlap(self) -> None:
         """Check that the shells do not overlap undeformed.
@@ -435,9 +470,10 @@ class MeridianContact(ContactTerm):
         Raises
         ------
         MeshError
-            With the place of the deepest penetration.
+            If they do, with the place of the deepest penetration.
         """
-        places = self._projections(0 * self._r0, self._h)
+        undeformed = 0 * self._r0  # the displacement zero
+        places = self._projections(undeformed, self._h)
         penetration = self._h - places.distance
         if len(penetration) and penetration.max() > PENETRATION_TOLERANCE * self._h:
             deepest = places.point[int(penetration.argmax())]
@@ -470,7 +506,9 @@ class MeridianContact(ContactTerm):
         # the area and the force of each cell: of a free end alone on a face, half of the force acts
         # on the cell of the face
         area = np.bincount(cell, weight, count)
-        force_of_places = weight[places.point] * self._penalty(places)[1]
+        _, pressure, _ = self._penalty(places)
+        force_of_places = weight[places.point] * pressure
+        # whether each place is at a free end, and whether its cell is steep to the point's
         at_end, is_steep = self._end_and_steepness(places)
         own_share = np.where(is_steep & ~at_end, 0.5, 1.0)
         force = np.bincount(cell[places.point], own_share * force_of_places, count)
@@ -491,6 +529,7 @@ class MeridianContact(ContactTerm):
         Curves are looked at in samples of the way. Between two samples no point moves, relative to
         another, by more than a part of the least thickness.
         """
+        # half the thickness of the pair: undeformed, and at both ends of the way
         halves = [
             self._half_at(displacement)[self._nodes_of_pair] for displacement in (0 * u, u, v)
         ]
@@ -498,7 +537,8 @@ class MeridianContact(ContactTerm):
         motion = v - u
         # the mean axial motion moves all curves alike
         motion = motion - [0.0, motion[:, 1].mean()]
-        # twice, since two points may move in opposite directions
+        # number of parts of the way; twice the motion, since two points may move in opposite
+        # directions
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         reach = CROSSING_DISTANCE * least_thickness
@@ -526,8 +566,9 @@ class MeridianContact(ContactTerm):
             (nodes, 2) displacement of the whole step.
         """
         places = self._active_set()
-        if self._offsets:
+        if self._offsets:  # faces also move as the thickness changes, the last component
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
+        # derivatives of the distances by the unknowns of the nodes of both cells
         _, n, beta, nodes = self._geometry(places)
         by_unknowns = distance_slopes(n, beta, motion.shape[1])
         # increase of the penetration over the step
@@ -557,8 +598,10 @@ class MeridianContact(ContactTerm):
         """
         u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
         if self._frozen:
-            self._at, places = np.array(u), self._frozen[0]
-            return self._follow(places) if len(places.point) else places
+            self._at = np.array(u)
+            frozen_places, _ = self._frozen
+            return self._follow(frozen_places) if len(frozen_places.point) else frozen_places
+        # the places are found again where the displacement or the growth has changed
         if growth != self._growth or not np.array_equal(u, self._at):
             self._at, self._places = self._active_sets.get(
                 (u, growth), lambda: self._find_places(np.array(u))
@@ -572,11 +615,16 @@ class MeridianContact(ContactTerm):
         return u, places.select(~self._are_left_to_edges(places))
 
     def _penalty(self, places: MeridianProjections) -> tuple[Array, Array, Array]:
-        """Return the penalty (n,) of places, with its two derivatives by the penetration."""
+        """Return the penalty of places, with its two derivatives by the penetration, (n,) each.
+
+        They are the energy per area, the pressure, and the stiffness of the contact.
+        """
         penetration, k = self._h - places.distance, self.stiffness.value
         soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
-            # a held contact serves differences of tangents, which need the third order
+            # a Taylor polynomial about the frozen penetrations. A contact that is held at one
+            # state (`hold` of the base class) serves differences of tangents, which need the
+            # third order
             is_held = self.held is not None
             _, frozen_penetration = self._frozen
             return expanded_penalty(
@@ -593,7 +641,10 @@ class MeridianContact(ContactTerm):
     def expand_about(self, frozen: tuple[MeridianProjections, Array]) -> None:
         """Use the frozen contact of another scene on the same mesh for all later states.
 
-        See `frozen_contact`.
+        Parameters
+        ----------
+        frozen
+            The result of `freeze`: the places, and their penetrations (n,) over R.
         """
         self._frozen = frozen
 
@@ -605,11 +656,13 @@ class MeridianContact(ContactTerm):
         r, X = self._places_of_nodes(self._at), places.X
         x, nodal = self._places_of_points(r)[places.point], r[self._nodes[places.cell]]
         for _ in range(FOLLOW_ITERATIONS):  # a fixed number keeps the result smooth in the state
+            # minus the first derivative of the distance by X, and the second
             descent, curvature, _ = slopes(x, self._curves.jets(X, nodal))
             X = X + np.where(
                 places.is_free, descent / np.where(places.is_free, curvature, 1.0), 0.0
             )
-        return replace(places, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
+        y, _, _ = self._curves.jets(X, nodal)
+        return replace(places, X=X, distance=distances(x - y))
 
     def _places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
         """Return all nodes (nodes, 3) at a displacement: rho, z, and half the thickness less h/2.
@@ -626,7 +679,7 @@ class MeridianContact(ContactTerm):
     def _places_of_points(self, r: Array) -> Array:
         """Return the points (n, dim) for nodes r (nodes, dim), dim 2 or 3.
 
-        The third component has the other sign, see `distances`.
+        A third component, half the thickness, has the other sign for points than for nodes.
         """
         nodal = r[self._nodes[self._points.cell]] * COMPONENT_SIGNS[: r.shape[1]]
         # shape functions k of each point n times the components i at the nodes of its cell
@@ -651,6 +704,7 @@ class MeridianContact(ContactTerm):
         # mid-surfaces may be farther apart than faces, by both offsets
         largest_offset = polynomial_bound(nodal[..., 2], self._curves.lebesgue_constant)
         reach = face_reach + 2 * largest_offset
+        # pairs of points and cells that may be nearer than that, and the closest place of each
         point, cell = self._candidates(x[:, :2], nodal[..., :2], reach)
         if not len(point):
             return no_projections()
@@ -661,17 +715,18 @@ class MeridianContact(ContactTerm):
     def _are_left_to_edges(self, places: MeridianProjections) -> Flags:
         """Return flags (n,): which places do not count, because a free end presses there.
 
-        They are places at the end of a shell that a point inside another shell faces steeply. See
-        `ClosestPointSearch.are_left_to_edges`. Normals are undeformed, so that the energy is a
-        function of the state.
+        They are places at the end of a shell that a point inside another shell faces steeply. Only
+        the end's own point presses there: it would catch at each point inside the other shell as it
+        slides. Normals are undeformed, so that the energy is a function of the state.
         """
         at_end, is_steep = self._end_and_steepness(places)
         return np.asarray(at_end & is_steep & ~self._points.is_on_edge[places.point])
 
     def _end_and_steepness(self, places: MeridianProjections) -> tuple[Flags, Flags]:
-        """Return two flags (n,): whether places are at a free end, and steep to the point.
+        """Return flags (n,) whether places are at a free end, and flags whether they are steep.
 
-        They are steep if the normals of both cells have a cosine below `STEEP_COSINE`.
+        A place is steep to its point if the undeformed normals of both cells have a cosine below
+        `STEEP_COSINE`.
         """
         # number of the cell's end, which counts only for places that are at one
         end = (places.X == 1.0).astype(np.int64)
@@ -694,9 +749,10 @@ class MeridianContact(ContactTerm):
         own_nodes = self._nodes[self._points.cell[places.point]]
         nodes = np.concatenate([own_nodes, self._nodes[places.cell]], axis=1)
         r = self._r0 + self._at
-        N, shape = self._points.shape[places.point], self._curves.table(0, places.X)[0]
-        beta = np.concatenate([N, -shape], axis=1)
-        off = np.einsum("nk,nki->ni", beta, r[nodes])
+        # shape functions of the point's cell at the point, and of the place's cell at the place
+        N_x, N_y = self._points.shape[places.point], self._curves.table(0, places.X)[0]
+        beta = np.concatenate([N_x, -N_y], axis=1)
+        off = np.einsum("nk,nki->ni", beta, r[nodes])  # x - y
         d = np.linalg.norm(off, axis=1)
         return d, off / d[:, None], beta, nodes
 
@@ -711,13 +767,50 @@ class MeridianContact(ContactTerm):
         places = self._active_set()
         _, first, second = self._penalty(places)
         d, n, beta, nodes = self._geometry(places)
-        off, (count, functions) = d[:, None] * n, beta.shape  # off is x - y
+        off = d[:, None] * n  # x - y
         # the places y with their derivatives along the curve, and A of the module's formula
         r = self._places_of_nodes(self._at)
         jets = self._curves.jets(places.X, r[self._nodes[places.cell]])
         _, A, _ = slopes(self._places_of_points(r)[places.point], jets)
+        y = jets[0]
+        rows = self._squared_rows(m, places, (d, n, beta), jets)  # (places, 4, dofs)
+        # factors of the squared rows; the terms of d,uu have the tension over the distance
+        weight = self._points.weight[places.point] / 2
+        B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
+        # a place that is not free does not move along the curve, and one on the axis not around it
+        by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
+        factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
+        H = rows.transpose(0, 2, 1) @ (factors[..., None] * rows)
+        # the term D . D, which is the same for U, V and W
+        isotropic_part = tension[:, None, None] * beta[:, :, None] * beta[:, None]
+        for i in range(3):
+            H[:, i::4, i::4] += isotropic_part
+        return H, nodes
+
+    def _squared_rows(
+        self,
+        m: float,
+        places: MeridianProjections,
+        geometry: tuple[Array, Array, Array],
+        jets: Array,
+    ) -> Array:
+        """Return four row vectors (places, 4, dofs) of each place, by (U, V, W, H) of both cells.
+
+        They are d,u; its part n . D, without H; and C_s and C_theta of the module's formulas.
+
+        Parameters
+        ----------
+        m
+            Number of waves.
+        geometry
+            Distances d (places,) from places to points, normals n (places, 2), and beta: the shape
+            functions of the point, minus those of the place.
+        jets
+            (3, places, 3) the places y and their two derivatives along the curve.
+        """
+        d, n, beta = geometry
+        off, (count, functions) = d[:, None] * n, beta.shape  # off is x - y
         y, tangent = jets[0], jets[1, :, :2]
-        # the four row vectors of each place: d,u, its part n . D by places, C_s, and C_theta
         shape, shape_slope = self._curves.table(1, places.X)
         rows = np.zeros((4, *beta.shape, 4))
         normal, closing, slide, circumferential = rows
@@ -729,19 +822,7 @@ class MeridianContact(ContactTerm):
         slide[:, half:, IN_PLANE] -= shape_slope[..., None] * off[:, None]
         slide[:, half:, 3] -= shape_slope * d[:, None]
         _fill_circumferential(circumferential, m, beta, y[:, :1], off, d, shape)
-        # factors of the squared rows; the terms of d,uu have the tension over the distance
-        weight = self._points.weight[places.point] / 2
-        B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
-        # a place that is not free does not move along the curve, and one on the axis not around it
-        by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
-        factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
-        flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)  # (places, 4, dofs)
-        H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
-        # the term D . D, which is the same for U, V and W
-        isotropic_part = tension[:, None, None] * beta[:, :, None] * beta[:, None]
-        for i in range(3):
-            H[:, i::4, i::4] += isotropic_part
-        return H, nodes
+        return np.asarray(rows.reshape(4, count, 4 * functions).swapaxes(0, 1))
 
 
 def _fill_circumferential(
@@ -779,7 +860,13 @@ class MeridianContactState(ContactState):
     def weight_slopes(self, tables: Array, places: Array) -> Array:
         """Return relative derivatives (n, functions, 2) of the points' weights by nodes.
 
-        The weight is rho |r'|, see `ContactState.weight_slopes`.
+        The weight is rho |r'| times constants.
+
+        Parameters
+        ----------
+        tables, places
+            Shape functions (n, functions) at the points with derivatives, and the undeformed
+            points (n, 2) with derivatives; the derivative along the curve is number 1 of both.
         """
         tangent = places[1]  # r'; the relative derivative of |r'| is along r'/|r'|^2
         direction = tangent / np.sum(tangent**2, axis=1)[:, None]

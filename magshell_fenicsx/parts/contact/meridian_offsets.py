@@ -40,8 +40,15 @@ class MeridianOffsets(FaceOffsets):
         The meridians.
     r0
         (nodes, 2) undeformed rho and z.
-    h, volume_factors, keeps_volume, amplitude
-        See `FaceOffsets`.
+    h
+        Thickness over R.
+    volume_factors
+        (powers, cells, functions) undeformed volume over h times the undeformed area at the nodes
+        of each cell, by powers of the amplitude.
+    keeps_volume
+        (cells,) whether the thickness follows from the area.
+    amplitude
+        The natural stretch, on which volumes depend; None without.
 
     The field `_slopes` (places, functions) has derivatives of shape functions at the nodes of a
     cell. `_value_table` (cells, places, functions) has shape functions of rho there, and on the
@@ -128,15 +135,21 @@ class MeridianOffsets(FaceOffsets):
         return rho, np.linalg.norm(tangent, axis=-1), a, b
 
     def _by_unknowns(self, rows: Array) -> Array:
-        """Return rows by the unknowns (cells, places, dofs), from rows by (U, V, W).
+        """Return rows by the unknowns (cells, places, dofs), from rows by (U, V, W) of nodes.
 
-        Without waves the unknowns are (U, W).
+        Without waves the unknowns are (U, W) alone.
+
+        Parameters
+        ----------
+        rows
+            (cells, places, functions, 3).
         """
         rows = rows if self._wave_number is not None else rows[..., IN_PLANE]
         return np.asarray(rows.reshape(*rows.shape[:2], rows.shape[2] * rows.shape[3]))
 
     def _area_slopes(self, u: Array, cells: Longs) -> Array:
         """Return derivatives (cells, places, dofs) of areas by the unknowns of cells."""
+        # rho, |r'|, and the rows a and b of the module's formula J,u = |r'| b + rho a/|r'|
         rho, speed, a, b = self._area_rows(u, cells)
         slopes = self._by_unknowns(speed[..., None, None] * b + (rho / speed)[..., None, None] * a)
         if not self._wave_number:
@@ -154,28 +167,29 @@ class MeridianOffsets(FaceOffsets):
         u, w
             (nodes, 2) displacement, and weights (cells, places).
         """
+        # rho, |r'|, and the rows a and b of the module's formulas
         rho, speed, a, b = self._area_rows(u, cells)
-        m, (_, tangent) = (
-            self._wave_number or 0.0,
-            self._radius_and_tangent(self._r0 + u, cells),
-        )
+        m = self._wave_number or 0.0
+        _, tangent = self._radius_and_tangent(self._r0 + u, cells)
         rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]  # rho' and z'
         value = self._value_table[cells]
-        # rows q, p, c, f, v of q, P, m W, f and V' in the module's formula, by (U, V, W): index 0,
-        # 1 or 2 in the last axis
-        q, p, c, f, v = np.zeros((5, *a.shape))
+        # rows of q, P, m W, f and V' in the module's formula, by (U, V, W): index 0, 1 or 2 in the
+        # last axis
+        q, P, m_W, f, V_slope = np.zeros((5, *a.shape))
         q[..., 0], q[..., 2] = (row * self._slopes / speed[..., None] for row in (-z1, rho1))
-        p[..., 0], p[..., 1] = m * value, value
-        c[..., 2] = m * value
-        v[..., 1] = self._slopes
-        f[..., :] = rho[..., None, None] * v - rho1[..., None] * p
+        P[..., 0], P[..., 1] = m * value, value
+        m_W[..., 2] = m * value
+        V_slope[..., 1] = self._slopes
+        f[..., :] = rho[..., None, None] * V_slope - rho1[..., None] * P
         f[..., 2] -= m * z1 * value
-        a, b, q, p, c, f, v = (self._by_unknowns(row) for row in (a, b, q, p, c, f, v))
+        a, b, q, P, m_W, f, V_slope = (
+            self._by_unknowns(row) for row in (a, b, q, P, m_W, f, V_slope)
+        )
         # factors of the squares of q and V', of P and m W, and of f
         w_stretch, w_turn = w * rho / speed, w * speed / rho
         w_shear = -w / (rho * speed)
-        # sums over the nodes q of a cell, by its unknowns m and n: of squares, and of 2 a b/|r'|
-        squares = (w_stretch, q), (w_stretch, v), (w_turn, p), (w_turn, c), (w_shear, f)
+        squares = (w_stretch, q), (w_stretch, V_slope), (w_turn, P), (w_turn, m_W), (w_shear, f)
+        # sums over the nodes of each cell, by its unknowns: of these squares, and of 2 a b/|r'|
         H = sum(np.einsum("cqm,cqn->cmn", weight[..., None] * row, row) for weight, row in squares)
         mixed = np.einsum("cqm,cqn->cmn", (w / speed)[..., None] * a, b)
         return np.asarray(H + mixed + np.swapaxes(mixed, 1, 2))

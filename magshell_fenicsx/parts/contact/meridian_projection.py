@@ -128,6 +128,9 @@ class NeighbouringMaterial:
         (cells, functions) node numbers of all cells, those of the ends first.
     cells_of_points
         (n,) number of each point's cell.
+
+    The field `_near` (cells, cells) says whether the way along the undeformed curve between two
+    cells is short. `_points` and `_nodal` are the undeformed points and nodes.
     """
 
     def __init__(self, points: Array, cells: Array, nodes: Longs, cells_of_points: Longs) -> None:
@@ -185,8 +188,8 @@ class NeighbouringMaterial:
             (n,) whether points are above or below their places, not beside them.
         """
         is_near = self.are_near(self.cells_of_points[places.point], places.cell)
-        undeformed = np.einsum("nk,nki->ni", shape, self._nodal[places.cell])
-        off = self._points[places.point] - undeformed
+        undeformed_places = np.einsum("nk,nki->ni", shape, self._nodal[places.cell])
+        off = self._points[places.point] - undeformed_places
         distance = np.linalg.norm(off[:, :2], axis=1)
         # the third component is minus the sum of both halves of the thickness
         is_far = distance > SELF_CONTACT_DISTANCE * np.abs(off[:, 2])
@@ -211,9 +214,10 @@ class CandidateSearch:
     material
         For a shell that may touch itself; both sides are then the same. Else None.
 
-    The fields `_starts` and `_counts` (cells,) are the number of the first point of each cell, and
-    how many it has. `_bulge` bounds the distance of a curve from its chord, over the largest one of
-    its inner nodes, which have the parameters `_inner_nodes`.
+    The fields `_first_cells` and `_second_cells` are the numbers of the cells of both shells.
+    `_starts` and `_counts` (cells,) are the number of the first point of each cell, and how many it
+    has. A curve bulges from its chord at most `_bulge` times as far as the farthest of its inner
+    nodes, which have the parameters `_inner_nodes` from 0 to 1.
     """
 
     def __init__(
@@ -255,6 +259,7 @@ class CandidateSearch:
         point, cell
             (m,) numbers.
         """
+        # pairs whose circles are near; of these the pairs are kept that are near by the chords
         point, cell = self._in_circles(nodal, reach)
         # of each cell: how far its curve is at most from its chord, by its inner nodes less the
         # places of the chord at the same parameters
@@ -292,8 +297,9 @@ class CandidateSearch:
             own_cell, cell = own_cell[may_touch], cell[may_touch]
         else:
             own_cell, cell = np.concatenate([own_cell, cell]), np.concatenate([cell, own_cell])
-        # the points of all own cells, one cell after the other: of each pair they count up from
-        # the cell's first point, while `np.arange` counts on from pair to pair
+        # from pairs of cells to pairs of points and cells. The points of an own cell have the
+        # numbers start, start + 1, ..., while `np.arange` counts on from pair to pair: the shift of
+        # each pair is the difference
         count = self._counts[own_cell]
         count_before = np.cumsum(count) - count
         shift = np.repeat(self._starts[own_cell] - count_before, count)
@@ -323,11 +329,12 @@ def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
     descent
         (n,) minus the first derivative.
     curvature
-        (n,) the second derivative, A of `meridian_contact`.
+        (n,) the second derivative, which is A in the formulas of `meridian_contact`.
     squared_speed
         (n,) the second derivative on a straight line, without the second derivative of the places.
     """
     y, first, second = jets
+    # the third component |x - y| multiplies the derivatives of half the thickness
     offset = (x - y)[:, :2]
     off = np.column_stack([offset, np.linalg.norm(offset, axis=1)])
     descent = np.sum(off * first, axis=1)
@@ -363,6 +370,8 @@ class MeridianCurves:
         A bound of the element's Lebesgue constant, see `projection.polynomial_bound`.
     slopes_at_nodes
         (nodes of a cell, functions) derivatives of shape functions at the nodes.
+
+    The field `_starts` has the places in a cell, from 0 to 1, at which Newton's method may begin.
     """
 
     def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
@@ -394,7 +403,9 @@ class MeridianCurves:
         return np.asarray(np.einsum("dnk,nki->dni", self.table(2, X), nodal))
 
     def rule(self, count: int, sides: tuple[Flags, Flags]) -> MeridianPoints:
-        """Return the quadrature points in each cell: Gauss's, and with one next to each free end.
+        """Return the quadrature points in the cells of both shells.
+
+        They are Gauss's, or of a rule with a point next to each free end of the cell.
 
         Parameters
         ----------
@@ -411,7 +422,10 @@ class MeridianCurves:
         for begins, ends in ((False, False), (True, False), (False, True), (True, True)):
             has_ends = (is_free_end == [begins, ends]).all(axis=1)
             cells = np.flatnonzero(np.any(sides, axis=0) & has_ends)
-            point_groups.append(self._points_of_cells(cells, count, begins, ends, sides[0]))
+            point_groups.append(
+                self._points_of_cells(cells, count, begins, ends, is_first=sides[0])
+            )
+        # the points of all groups as one set
         return MeridianPoints(
             *(
                 np.concatenate([getattr(group, attribute.name) for group in point_groups])
@@ -474,7 +488,8 @@ class MeridianCurves:
         for _ in range(MAX_NEWTON_ITERATIONS):
             jets = self.jets(X[moving], nodal[cell[moving]])
             descent, curvature, squared_speed = slopes(x[point[moving]], jets)
-            # where the distance is not convex, a step as on a straight line still goes downhill
+            # Newton's step; where the distance is not convex in X, a step as on a straight line
+            # still goes downhill
             is_convex = curvature > MIN_CURVATURE_RATIO * squared_speed
             step = descent / np.where(is_convex, curvature, squared_speed)
             previous = X[moving]
@@ -484,7 +499,7 @@ class MeridianCurves:
             if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
-        descent, *_ = slopes(x[point], jets)
+        descent, *_ = slopes(x[point], jets)  # minus the derivative of the distance by X
         # a place at an end is fixed if the distance falls on beyond the cell
         is_fixed = ((X == 0.0) & (descent <= 0)) | ((X == 1.0) & (descent >= 0))
         return MeridianProjections(point, cell, X, ~is_fixed, distances(x[point] - jets[0]))
@@ -496,14 +511,15 @@ class MeridianCurves:
         nodal: Array,
         material: NeighbouringMaterial | None,
     ) -> MeridianProjections:
-        """Return the places from which the curve goes on to no nearer place.
+        """Return the places that count: from which the curve goes on to no nearer place.
 
-        A point keeps its nearest place, and at most one on its other side.
+        A point keeps its nearest place, and at most one on its other side. Places in the material
+        around a point do not count.
 
         Parameters
         ----------
         x, nodal
-            Points and nodes of cells, see `project`.
+            (n, 3) places of all points, and (cells, functions, 3) of the nodes of all cells.
         material
             The material around points of a shell that may touch itself; else None.
         """
@@ -515,7 +531,8 @@ class MeridianCurves:
             shape = self.table(0, places.X)[0]
             is_distinct = material.are_distinct(places, shape, is_above)
             places, is_above = places.select(is_distinct), is_above[is_distinct]
-        # a place at an end counts if the cell beyond has one that is no nearer, or is not searched
+        # a place at an end of its cell counts if the point's place in the cell beyond is no nearer,
+        # or if that cell is not searched, as where the curve is folded there
         keys = places.point * len(self.nodes) + places.cell
         is_nearest: Flags = np.ones(len(places.point), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
@@ -530,6 +547,7 @@ class MeridianCurves:
             is_folded = self._are_folded(places, neighbour, is_above, material)
             is_nearest &= ~is_at_end | is_no_nearer_beyond | is_folded
         places = places.select(is_nearest)
+        # in the order of points, then of distances
         places = places.select(np.lexsort((places.distance, places.point)))
         if not len(places.point):
             return places
@@ -543,17 +561,20 @@ class MeridianCurves:
         places
             In the order of points and distances.
         x, nodal
-            See `project`.
+            (n, 3) all points, and (cells, functions, 3) the nodes of all cells.
         """
-        # unit vectors from places to points, and for each place the row of its point's nearest one
-        offset = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
-        offset = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
+        # unit vectors from places to points
+        y, _, _ = self.jets(places.X, nodal[places.cell])
+        offset = (x[places.point] - y)[:, :2]
+        direction = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
+        # the nearest place of each point is its first one; then its row for each place
         first_of_point = np.flatnonzero(np.diff(places.point, prepend=-1))
-        nearest = np.repeat(first_of_point, np.diff([*first_of_point, len(offset)]))
-        is_chosen = np.zeros(len(offset), dtype=bool)
+        nearest = np.repeat(first_of_point, np.diff([*first_of_point, len(direction)]))
+        is_chosen = np.zeros(len(direction), dtype=bool)
         is_chosen[first_of_point] = True
-        # the others in another direction, of which the first of each point is chosen too
-        is_opposite = np.sum(offset * offset[nearest], axis=1) < SAME_DIRECTION_COSINE
+        # places in another direction than the nearest; the first such place of each point is chosen
+        # too
+        is_opposite = np.sum(direction * direction[nearest], axis=1) < SAME_DIRECTION_COSINE
         opposite = np.flatnonzero(is_opposite)
         first_opposite = np.flatnonzero(np.diff(places.point[opposite], prepend=-1))
         is_chosen[opposite[first_opposite]] = True
@@ -569,7 +590,7 @@ class MeridianCurves:
         """Return flags (n,): whether the curve goes on into a cell that is not searched.
 
         That is the cell beyond a place, if it is near the point's own cell along the curve: the
-        curve is folded there. False stands for all places of two different shells.
+        curve is folded there. Between two different shells the result is False for all places.
 
         Parameters
         ----------
@@ -577,6 +598,8 @@ class MeridianCurves:
             (n,) cells beyond the places; -1 for none.
         is_above
             (n,) whether points are above or below their places.
+        material
+            The material around points of a shell that may touch itself; else None.
         """
         if not material:
             return False
@@ -586,14 +609,15 @@ class MeridianCurves:
     def _are_above(self, places: MeridianProjections, x: Array, nodal: Array) -> Flags:
         """Return flags (n,): whether points are above or below their places.
 
-        The others are beside their places, as in one straight curve.
+        The others are beside their places, as in one straight curve. Points x and the nodes of all
+        cells are those of `project`.
         """
         y, tangent, _ = self.jets(places.X, nodal[places.cell])[..., :2]
         offset = x[places.point, :2] - y
-        height = np.abs(offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0])
+        # over the product of the lengths it is the sine of the angle between offset and curve
+        cross_product = np.abs(offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0])
         product_of_lengths = np.linalg.norm(offset, axis=1) * np.linalg.norm(tangent, axis=1)
-        # the ratio is the sine of the angle between the offset and the curve
-        return np.asarray(height > ABOVE_SINE * product_of_lengths)
+        return np.asarray(cross_product > ABOVE_SINE * product_of_lengths)
 
     def cell_normals(self) -> Array:
         """Return the undeformed unit normals (cells, 2) of the lines between the ends."""

@@ -117,7 +117,8 @@ class ModelSurface:
             factor = self.thickness.x.array[dofs]
         if not (self.natural and self.grows):
             return np.array([factor])
-        # (2, local cells, nodes, 3): undeformed tangents at the nodes of cells
+        # (2, local cells, nodes, 3): undeformed tangents at the nodes of cells, by the derivatives
+        # of shape functions there
         V = self.space
         element = V.element.basix_element
         slopes = element.tabulate(1, element.points)[1:, ..., 0]
@@ -186,6 +187,7 @@ class _AllCells:
         The copies share vertices on planes of symmetry, and nodes there count as one place.
         """
         images, facets = Images(surface.images, len(self.r0)), surface.facets_on_planes
+        # global numbers of nodes and vertices on planes of symmetry
         nodes = _nodes_of_facets(surface.space, facets)
         vertices = _vertices_of_facets(surface.topology, facets)
         return replace(
@@ -222,6 +224,7 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
         surface.topology.create_connectivity(*dims)
     global_cells, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
     all_cells = _AllCells.gather(surface, global_cells)
+    # number of this rank's first degree of freedom, and how many it has
     first_node, _ = index_map.local_range
     own_dofs = 3 * first_node, 3 * index_map.size_local
     if surface.images:
@@ -255,7 +258,9 @@ def _contact_geometry(
     """
     cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
     element, first_cell = surface.space.element.basix_element, global_cells.own_range.start
-    if images:  # forces are summed over all copies, then added to the model's unknowns
+    if images:
+        # this rank first takes the forces on all unknowns of all copies; `ContactWithImages` then
+        # adds those on its own unknowns of the model
         own_dofs = 0, r0.size
     growth: SettableNumber | None = surface.natural.stretch if surface.natural else None
     offsets = None  # where the thickness is h everywhere and in all states
@@ -300,7 +305,7 @@ def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
     Raises
     ------
     MeshError
-        On every rank, with the depth and the place.
+        On every rank if they do, with the depth and the place.
     """
     penetration, x = contact.deepest_penetration()
     if penetration > PENETRATION_TOLERANCE * h:

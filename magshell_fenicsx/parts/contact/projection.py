@@ -99,8 +99,9 @@ class Cells:
     @cached_property
     def is_on_edge(self) -> NDArray[np.bool_]:
         """(cells, 3): whether each corner is on an edge of the surface."""
-        cell, side = np.nonzero(self.neighbours < 0)
+        cell, side = np.nonzero(self.neighbours < 0)  # the sides on an edge
         is_on_edge = np.zeros(self.corners.max() + 1, dtype=bool)  # of vertices
+        # side k has the two corners that it is not opposite to
         for corner in ((side + 1) % 3, (side + 2) % 3):
             is_on_edge[self.corners[cell, corner]] = True
         return np.asarray(is_on_edge[self.corners])
@@ -115,10 +116,11 @@ class Cells:
         cosine
             Cosine of the angle above which a turn counts.
         """
-        cell, side = np.nonzero(self.neighbours < 0)
-        slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]  # of shape functions at corners
-        # sums at vertices of the unit tangents of both sides, each away from the vertex: where the
-        # edge is even they cancel
+        cell, side = np.nonzero(self.neighbours < 0)  # the sides on an edge
+        # (2, 3, functions): derivatives of shape functions by both coordinates at the corners
+        slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]
+        # at each vertex the sum of the unit tangents of both sides on the edge, each away from the
+        # vertex: where the edge is straight they cancel
         turn = np.zeros((int(self.corners.max()) + 1, 3))
         begin, end = (side + 1) % 3, (side + 2) % 3  # corners of each side on an edge
         sides = CORNERS[end] - CORNERS[begin]
@@ -126,7 +128,7 @@ class Cells:
             tangent = np.einsum("kd,dkn,kni->ki", sides, slopes[:, corner], r0[self.nodes[cell]])
             tangent /= np.linalg.norm(tangent, axis=1)[:, None]
             np.add.at(turn, self.corners[cell, corner], sign * tangent)
-        # the length of the difference of two unit vectors with this cosine
+        # two unit vectors whose angle has this cosine have a difference of this length
         is_turn = np.linalg.norm(turn, axis=1) > np.sqrt(2 * (1 - cosine))
         return np.asarray(is_turn[self.corners])
 
@@ -175,7 +177,7 @@ class Cells:
         r0, distance
             (nodes, 3) undeformed places, and (nodes,) length up to which a way is short.
         """
-        # both at vertices, from their values at nodes
+        # places and lengths at vertices, by shape functions from their values at nodes
         x, reach = np.zeros((int(self.corners.max()) + 1, 3)), np.zeros(int(self.corners.max()) + 1)
         x[self.corners], reach[self.corners] = (
             self.at_corners @ r0[self.nodes],
@@ -203,6 +205,7 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         Numbers i * cells + j of pairs of cells, ascending.
     """
     vertex_count, (cell_count, per_cell) = len(x), corners.shape
+    # pairs of vertices that are near each other
     i, j = _near_vertices(_graph_of_sides(corners, x), x, reach)
     # sparse flags: which vertices are near each other, and which vertices a cell has
     is_near = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (vertex_count, vertex_count))
@@ -217,7 +220,12 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
 def _graph_of_sides(corners: Longs, x: Array) -> scipy.sparse.csr_array:
     """Return the graph (vertices, vertices) of the sides of cells, with their lengths.
 
-    Parameters are those of `near_along_surface`.
+    Parameters
+    ----------
+    corners
+        (cells, 3) vertices, or (cells, 2) of a curve.
+    x
+        (vertices, dim) undeformed places.
     """
     shape = len(x), len(x)
     begins, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
@@ -234,9 +242,10 @@ def _near_vertices(graph: scipy.sparse.csr_array, x: Array, reach: Array) -> tup
     Parameters
     ----------
     graph
-        See `_graph_of_sides`.
+        (vertices, vertices) sparse: the lengths of sides.
     x, reach
-        See `near_along_surface`.
+        (vertices, dim) undeformed places, and (vertices,) the reach. A way is short enough if it is
+        at most the mean of the reach at its two ends.
     """
     farthest = float(reach.max())
     # strips of vertices along the longest axis keep the matrices of ways small
@@ -441,27 +450,49 @@ def nearest_places(
     pair, places
         (m,) number of each place's pair, and the m places; their `side` is 0.
     """
-    cell, first, number, order = pairs
+    cell, first, number, order = pairs  # order: the list of points
     used_cells, row_of_cell = np.unique(cell, return_inverse=True)
-    nodal = r[cells.nodes[used_cells]]
-    positions = nodal[..., :3]
     # stand-ins for missing arguments: without flags the C function does not read them
     no_flags = np.zeros(len(cell), dtype=bool)
     reference = undeformed or UndeformedPairs(no_flags, r, x, 0.0)
     search_limits = limits or ProjectionLimits(no_flags, np.zeros(len(x)))
-    bounds = _bounds_of_cells(positions)
-    lattice_places = [np.matmul(positions.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
-    # coefficients of each cell's polynomials, deformed and undeformed
-    monomials = [
-        cells.monomials @ _as_four_components(array)
-        for array in (nodal, reference.r[cells.nodes[used_cells]])
-    ]
-    # the fields of `Cells` in C, in their order: sizes, then arrays, which must stay in memory
-    c_sizes = cells.element.degree, *(len(X) for X, _ in cells.lattices)
-    (ffi, lib), pointers = library(), _pointers
-    c_cells = ffi.new(
-        "Cells *", [*c_sizes, *pointers(*monomials, *lattice_places, cells.lattices[-1][0], bounds)]
+    # the arrays of the struct must stay in memory during the call
+    c_cells, _arrays_of_struct = _struct_of_cells(cells, r, reference.r, used_cells)
+    pairs_in_c = row_of_cell.ravel(), first, number, order
+    point, pair, X, free_directions, distance, direction, is_above = _nearest_in_c(
+        c_cells, pairs_in_c, x, reference, search_limits, (reach, max_distance)
     )
+    side = np.zeros(len(pair), dtype=np.int64)
+    return pair, Projections(
+        point, cell[pair], X, free_directions, distance, side, direction, is_above
+    )
+
+
+def _nearest_in_c(
+    c_cells: Any,
+    pairs: tuple[Longs, Longs, Longs, Longs],
+    x: Array,
+    reference: UndeformedPairs,
+    limits: ProjectionLimits,
+    distances: tuple[float, float],
+) -> list[NDArray[Any]]:
+    """Return the results of `nearest` in C, one row for each place that was found.
+
+    They are the arrays `point`, `pair`, `X`, `free_directions`, `distance`, `direction` and
+    `is_above`: see `nearest_places` for pairs, and `Projections` for the others.
+
+    Parameters
+    ----------
+    c_cells
+        The struct of the cells in C.
+    pairs
+        As in `nearest_places`, with the row of each cell in the struct in place of its number.
+    x
+        (n, 3 or 4) points over R.
+    distances
+        `reach` and `max_distance` of `nearest_places`.
+    """
+    (_, lib), pointers, (row_of_cell, first, number, order) = library(), _pointers, pairs
     # arrays for the results
     capacity = int(number.sum())  # each pair of point and cell has at most one place
     point, pair = np.empty((2, capacity), dtype=np.int64)
@@ -469,31 +500,49 @@ def nearest_places(
     is_above = np.empty(capacity, dtype=bool)
     results = point, pair, *floats, is_above
     # the call; arguments have the order of `nearest` in C
-    pair_arguments = row_of_cell.ravel(), first, number, reference.is_near, search_limits.is_bounded
+    pair_arguments = row_of_cell, first, number, reference.is_near, limits.is_bounded
     point_arguments = order, _as_four_components(x), _as_four_components(reference.x)
-    arguments = pointers(*pair_arguments, search_limits.reach, *point_arguments)
+    arguments = pointers(*pair_arguments, limits.reach, *point_arguments)
     count = lib.nearest(
         c_cells,
-        len(cell),
+        len(row_of_cell),
         *arguments,
-        reach,
-        max_distance,
+        *distances,
         reference.least_distance_ratio,
         *pointers(*results),
     )
     # the first `count` rows have results
-    X, free_directions, distance, direction = (array[:count] for array in floats)
-    side = np.zeros(count, dtype=np.int64)
-    return pair[:count], Projections(
-        point[:count],
-        cell[pair[:count]],
-        X,
-        free_directions,
-        distance,
-        side,
-        direction,
-        is_above[:count],
-    )
+    return [array[:count] for array in results]
+
+
+def _struct_of_cells(
+    cells: Cells, r: Array, r0: Array, used_cells: Longs
+) -> tuple[Any, list[Array]]:
+    """Return the struct `Cells` in C for some cells, and the arrays to which it points.
+
+    Parameters
+    ----------
+    r, r0
+        (nodes, 3 or 4) deformed and undeformed places of all nodes.
+    used_cells
+        Numbers of the cells.
+    """
+    nodal = r[cells.nodes[used_cells]]
+    positions = nodal[..., :3]
+    # (used cells, 6) spheres around cells, and their largest distances from both lattices; then the
+    # places of both lattices in each cell
+    bounds = _bounds_of_cells(positions)
+    lattice_places = [np.matmul(positions.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
+    # coefficients of each cell's polynomials, deformed and undeformed
+    monomials = [
+        cells.monomials @ _as_four_components(array)
+        for array in (nodal, r0[cells.nodes[used_cells]])
+    ]
+    # the members of the struct in their order: sizes, then arrays
+    sizes = cells.element.degree, *(len(X) for X, _ in cells.lattices)
+    arrays = [*monomials, *lattice_places, cells.lattices[-1][0], bounds]
+    ffi, _ = library()
+    return ffi.new("Cells *", [*sizes, *_pointers(*arrays)]), arrays
 
 
 def _bounds_of_cells(positions: Array) -> Array:
@@ -571,7 +620,8 @@ def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_direction
     nodal
         (n, functions, 3 or 4) places of the nodes of each place's cell after the motion.
     X, free_directions
-        Places before the motion, and where they can move: see `Projections`.
+        (n, 2) places before the motion, and (n, 2, 2) matrices whose columns are the directions in
+        which they can move; other columns are zero.
     """
     for _ in range(FOLLOW_ITERATIONS):
         # the places, and their derivatives y1, y2, y11, y12, y22; shape functions are not needed
@@ -592,8 +642,8 @@ def distances(off: Array) -> Array:
 def with_length(off: Array) -> Array:
     """Return differences (n, 3 or 4) with the length of the first three as fourth component.
 
-    Differences of three components stay. The product with a derivative of the surface is then minus
-    |x - y| times that of the distance, see `slopes`.
+    Differences of three components stay as they are. The scalar product of the result with a
+    derivative of the surface by X is minus |x - y| times the derivative of the distance by X.
     """
     return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
@@ -609,7 +659,7 @@ def slopes(
     Parameters
     ----------
     off
-        (n, 3 or 4) from the places to the points, see `with_length`.
+        (n, 3 or 4) vectors from the places to the points; a fourth component is their length.
     y1, y2, y11, y12, y22
         (n, 3 or 4) derivatives of the surface at the places.
     """
@@ -629,14 +679,10 @@ def slopes(
 def _solve_in_free_directions(free_directions: Array, A: Array, g: Array) -> Array:
     """Return A^-1 g (n, 2) in the free directions, for A (n, 2, 2) and g (n, 2)."""
     inverse = inverse_in_free_directions(free_directions, A)
-    # components of the result along the free directions, then in the reference cell
-    components = np.einsum("nij,nj->ni", inverse, _in_free_directions(free_directions, g))
+    # components of g, then of the result along the free directions; then the result itself
+    components_of_g = np.einsum("nji,nj->ni", free_directions, g)
+    components = np.einsum("nij,nj->ni", inverse, components_of_g)
     return np.asarray(np.einsum("nij,nj->ni", free_directions, components))
-
-
-def _in_free_directions(free_directions: Array, g: Array) -> Array:
-    """Return the components (n, 2) of vectors g (n, 2) along the free directions."""
-    return np.asarray(np.einsum("nji,nj->ni", free_directions, g))
 
 
 def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
@@ -645,6 +691,7 @@ def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
     Where a direction is not free, 1 stands on the diagonal, so that the matrix can be inverted.
     """
     is_fixed = np.asarray(~free_directions.any(axis=1))  # (n, 2): a column that is zero
+    # A in components along the free directions, and its inverse: the adjugate by the determinant
     reduced = np.einsum("nji,njk,nkl->nil", free_directions, A, free_directions)
     reduced[:, 0, 0] += is_fixed[:, 0]
     reduced[:, 1, 1] += is_fixed[:, 1]
@@ -674,7 +721,8 @@ def near_spheres(
     own_spheres
         Numbers of the spheres from which i is taken; j is any sphere.
     """
-    # classes by powers of two; `classes` has all spheres, `own_classes` those for i
+    # numbers of spheres by powers of two of the radius: of all spheres in `classes`, which have
+    # search trees; of those from which i is taken in `own_classes`
     radius_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(radius_class == k) for k in np.unique(radius_class)]
     own_classes = [own_spheres[radius_class[own_spheres] == k] for k in np.unique(radius_class)]

@@ -41,18 +41,20 @@ def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[
     corner
         Distance over the side's length of a further point on it from each turning end.
     """
-    # on lines from the first corner: the area element has the weight t, the distance from it
+    # t goes along lines from the first corner, from 0 there to 1 on the third side; the area
+    # element has the weight t
     t, weights_t = _rule_with_points((degree + 1) // 2, fixed_points=[1 - EDGE_OFFSET], power=1)
-    # across these lines: `turning_ends` has the flags 1 and 2 of both ends
-    fixed_points = [corner] if turning_ends & 1 else []
-    if turning_ends & 2:
+    # points near the turning ends of the side, on [0, 1] along it
+    turns_at_begin, turns_at_end = turning_ends & 1, turning_ends & 2
+    fixed_points = [corner] if turns_at_begin else []
+    if turns_at_end:
         fixed_points.append(1 - corner)
     # n free and m fixed points are exact to the degree 2 n + m - 1
     inner_line = _rule_with_points((degree + 2) // 2, fixed_points=[], power=0)
     last_line = _rule_with_points((degree + 2 - len(fixed_points)) // 2, fixed_points, power=0)
     places, weights = list[Array](), list[Array]()
     for position, weight in zip(t, weights_t, strict=True):
-        # s goes along the side; the last line is next to the side
+        # s goes across the lines, parallel to the side; at the last t the points are next to it
         s, weights_s = last_line if position == t[-1] else inner_line
         places.append(np.stack([position * (1 - s), position * s], axis=1))
         weights.append(weight * weights_s)
@@ -118,7 +120,7 @@ def _rule_with_points(count: int, fixed_points: Sequence[float], power: int) -> 
         eigvals_only=True,
     )
     points = np.sort([*((1 + free_points) / 2), *fixed_points])
-    # weights that integrate Legendre's polynomials exactly
+    # weights that integrate as many of Legendre's polynomials exactly as there are points
     moments = legendre(x, point_count - 1).T @ weight
     return points, np.linalg.solve(legendre(2 * points - 1, point_count - 1).T, moments)
 

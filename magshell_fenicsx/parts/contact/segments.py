@@ -252,6 +252,7 @@ class Polygons:
         corners, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
         # a repeated corner begins a side of no length, which does not count
         has_side = np.linalg.norm(corners - next_corners, axis=2) > SAME_CORNER_TOLERANCE
+        # of each side whether it is on an edge, and at which ends this turns: see `Triangles.ends`
         ends = self._ends_of_sides(has_side, open_sides, edge_turns)
         edge_count = (ends != NOT_ON_EDGE).sum(axis=1)
         is_whole = (has_side.sum(axis=1) == 3) & (edge_count <= 1)
@@ -271,16 +272,19 @@ class Polygons:
         return Triangles.concatenate([single, fans])
 
     def _ends_of_sides(self, has_side: Flags, open_sides: Flags, edge_turns: Flags) -> Longs:
-        """Return the `ends` (n, m) of all sides of the polygons, see `Triangles`.
+        """Return the `ends` (n, m) of all sides of the polygons.
 
-        Side k goes from corner k to the next one.
+        They are `NOT_ON_EDGE` of a side that is not on an edge of the surface. Otherwise they are
+        the sum of 1 if the edge turns at the side's begin, and of 2 if it turns at its end. Side k
+        goes from corner k to the next one.
 
         Parameters
         ----------
         has_side
             (n, m) whether the side that begins at a corner has a length.
         open_sides, edge_turns
-            See `triangles`.
+            (cells, 3) whether the side opposite to a corner of a cell is on an edge, and whether
+            the edge turns in this corner.
         """
         # barycentric coordinates: number k is zero on side k of the cell, opposite to its corner k
         x, y = self.corners[..., 0], self.corners[..., 1]
@@ -303,8 +307,8 @@ class Polygons:
         Parameters
         ----------
         has_side, ends
-            (n, m) whether a side of finite length begins at a corner, and the `ends` of that side,
-            see `Triangles`.
+            (n, m) whether a side of finite length begins at a corner, and the `ends` of that side:
+            `NOT_ON_EDGE`, or 0 to 3 for a side on an edge.
         """
         # the three sides of finite length, in their order; repeated corners begin the others
         side_numbers = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
@@ -333,8 +337,8 @@ class Polygons:
         Each polygon has a line of its own (the algorithm of Sutherland and Hodgman). The result may
         have polygons without an area.
         """
-        # heights of corners above the line, times its length; a side is crossed if its two corners
-        # have heights of different signs
+        # heights of corners to the left of the line, times its length; the line crosses a side
+        # whose two corners have heights of different signs
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         height = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
         height[np.abs(height) < AREA_TOLERANCE] = 0.0
@@ -406,7 +410,8 @@ class Segments:
         the rule.
 
     The field `_edge_turns` (cells, 3) says whether the edge turns at each corner. `_corner_offset`
-    is the distance of a point next to such a turn from it.
+    is the distance of a point next to such a turn from it. `_cells`, `_r0` and `_degrees` are the
+    arguments.
     """
 
     def __init__(
@@ -460,7 +465,7 @@ class Segments:
         """
         cell_count, rule = len(self._cells.nodes), self.rule
         if not len(near_places.point):
-            return rule
+            return rule  # no cell faces another
         # each pair of a cell and a cell that it faces once
         keys = np.unique(rule.cell[near_places.point] * cell_count + near_places.cell)
         cell, faced_cell = keys // cell_count, keys % cell_count
@@ -468,6 +473,8 @@ class Segments:
         centres = self._corners(self._r0, faced_cell).mean(axis=1)
         order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
         cell, faced_cell = cell[order], faced_cell[order]
+        # the faced cells as triangles in the reference cells; then all parts of the cells, cut
+        # along the sides of these triangles, as triangles
         faced_triangles = Polygons(cell, faced_cell, self._projected_corners(cell, faced_cell, r))
         triangles = self._triangles(cut_by_triangles(faced_triangles))
         # cells that face none are not cut, and keep the points of the rule
@@ -487,8 +494,8 @@ class Segments:
         """
         X = CORNERS_AND_CENTROID
         # weights and divisions of these points have no meaning: only their gaps are needed
-        corner_points = self._points_by_rule(triangles, X, weights=np.ones(len(X)), divisions=0)
-        gap = gaps(corner_points).reshape(-1, len(X))
+        sample_points = self._points_by_rule(triangles, X, weights=np.ones(len(X)), divisions=0)
+        gap = gaps(sample_points).reshape(-1, len(X))  # (triangles, 4)
         return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
 
     def _triangles(self, polygons: Polygons) -> Triangles:
@@ -502,8 +509,9 @@ class Segments:
         Triangles of one kind have one rule: kinds differ in whether they are small, in `ends`, and
         in how far the point next to a turn of the edge is from the turn.
         """
-        # the kind of each triangle: whether it is small, its `ends`, and the distance of a point
-        # from a turn; it is small by the size that it had before divisions, which is twice its area
+        # the kind of each triangle has three numbers. First: whether it is small, by the size that
+        # it had before divisions; the size is twice the area. Second: its `ends`. Third: the
+        # distance of a point from a turn of the edge
         is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
         has_turn = triangles.ends > 0
         turn_distance = np.where(has_turn, self._corner_shares(triangles), 0)
@@ -513,6 +521,8 @@ class Segments:
         points = list[ContactPoints]()
         for k, (is_small_kind, ends, distance_from_turn) in enumerate(kinds):
             degree = self._degrees[int(is_small_kind)]  # the second one for small triangles
+            # (points of a triangle, 2) and their weights; a triangle on an edge has points next to
+            # its third side, and next to the ends of this side where the edge turns
             X, weights = (
                 triangle_rule(degree)
                 if ends == NOT_ON_EDGE
@@ -523,9 +533,10 @@ class Segments:
         return points
 
     def _corner_shares(self, triangles: Triangles) -> Array:
-        """Return the distances (n,) of points from turns of the edge, over the third side's length.
+        """Return how far a point is from a turn of the edge, (n,) over the third side's length.
 
-        They are limited on short sides, and rounded to powers of two so that there are few rules.
+        The share is limited on short sides, and rounded to a power of two so that there are few
+        rules.
         """
         corners, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
         side_length = np.linalg.norm(
@@ -542,11 +553,12 @@ class Segments:
         Parameters
         ----------
         X, weights
-            (m, 2) points in the reference triangle, and (m,) weights.
+            (m, 2) points of the rule in the reference triangle, and (m,) weights.
         divisions
             How often the triangles have been divided.
         """
-        # (n, m, 2): the rule's points in the reference cell of each triangle
+        # (n, m, 2): the rule's points in the reference cell of each triangle; then the cell of each
+        # of these n m points, and the cell that it faces
         X_in_cells = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
         X_in_cells = X_in_cells + X[:, 1:] * triangles.e2[:, None]
         cell, faces = (np.repeat(numbers, len(X)) for numbers in (triangles.cell, triangles.faces))
@@ -592,8 +604,9 @@ class Segments:
             (nodes, 3) places of nodes.
         """
         corners, other_corners = self._corners(r, cell), self._corners(r, other)
+        # both sides of each cell from its first corner
         sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
-        # the pseudoinverse projects along the normal
+        # the pseudoinverse projects along the normal; then barycentric coordinates
         X = (other_corners - corners[:, :1]) @ np.linalg.pinv(sides)
         coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
         # corners near a side are moved onto it, so that no slivers are cut
@@ -623,8 +636,10 @@ class Cuts:
     r0
         (nodes, 3) undeformed places over R.
 
-    The field `_displacements` has number -> displacement of the cuts, of all numbers that are
-    known. `_latest_points` has number -> points and normals, of the last two that were asked for.
+    The field `_displacements` has number -> displacement (nodes, 3) at which the cuts are made, for
+    all numbers that are known. `_latest_points` has number -> points and normals, for the last two
+    numbers that were computed. `_find_near` and `_find_gaps` are the arguments `near_places` and
+    `gaps`.
     """
 
     def __init__(
@@ -647,10 +662,10 @@ class Cuts:
         """
         if number not in self._latest_points:
             cut_u = self._displacements.setdefault(number, np.array(u))
-            # the last number of before stays, and the new one comes after it
-            last_item = [*self._latest_points.items()][-1:]
+            # of the numbers in memory the latest stays, and the new one comes after it
+            latest_item = [*self._latest_points.items()][-1:]
             points_and_normals = self.points_at(cut_u, divisions_of(number))
-            self._latest_points = {**dict(last_item), number: points_and_normals}
+            self._latest_points = {**dict(latest_item), number: points_and_normals}
         return self._latest_points[number]
 
     def displacement(self, number: float) -> Array:
@@ -710,26 +725,27 @@ def cut_by_triangles(triangles: Polygons) -> Polygons:
         cell.
     """
     cells, row_of_cell = np.unique(triangles.cell, return_inverse=True)
-    # the common part of each pair of a cell and a triangle
+    # the common part of each pair of a cell and a triangle; pairs without an area do not count
     common = _common_parts(Polygons.cells(triangles.cell), triangles)
     is_common = np.abs(area(triangles.corners)) > AREA_TOLERANCE
     is_common &= area(common.corners) > AREA_TOLERANCE
     common, row_of_cell = common.select(is_common), row_of_cell[is_common]
     # the sum of the parts is the cell's area if triangles cover it without an overlap
     covered = np.bincount(row_of_cell, area(common.corners), len(cells))
-    is_partial = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
-    if not is_partial.any():
+    is_inexact = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
+    if not is_inexact.any():
         return common
-    # the other cells are cut again; `common_once` counts what several triangles cover once
-    partial_triangles = triangles.select(is_common).select(is_partial[row_of_cell])
-    common_once, remainder = _cut_one_by_one(partial_triangles, cells[is_partial])
-    # common parts and the rest make the whole cell if no triangles overlap
+    # the other cells are cut again: into parts in which what several triangles cover is counted
+    # once, and a remainder that none covers
+    inexact_triangles = triangles.select(is_common).select(is_inexact[row_of_cell])
+    common_once, remainder = _cut_one_by_one(inexact_triangles, cells[is_inexact])
+    # common parts and the remainder make the whole cell if no triangles overlap
     uncovered = np.bincount(
         np.searchsorted(cells, remainder.cell), area(remainder.corners), len(cells)
     )
     is_complete = np.abs(covered + uncovered - REFERENCE_AREA) <= AREA_TOLERANCE
     # only cells in which triangles overlap take the parts of the second cutting
-    overlapped = cells[is_partial & ~is_complete]
+    overlapped = cells[is_inexact & ~is_complete]
     without_overlap = common.select(~np.isin(common.cell, overlapped))
     with_overlap = common_once.select(np.isin(common_once.cell, overlapped))
     return without_overlap.concatenate_with(with_overlap).concatenate_with(remainder)
@@ -742,15 +758,16 @@ def _common_parts(polygons: Polygons, triangles: Polygons) -> Polygons:
     """
     common = polygons.with_faces(triangles.faces)
     a, b = oriented_sides(triangles.corners)
-    for k in range(3):
+    for k in range(3):  # what is to the left of each side of the triangle
         common = common.clip(a[:, k], b[:, k])
     return common
 
 
 def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygons]:
-    """Return the common parts of cells and triangles, and the rest of the cells, facing nothing.
+    """Return the common parts of cells and triangles, and the rest of the cells.
 
-    Each triangle is cut out of what the earlier triangles have left of its cell.
+    The rest faces no cell (`NO_CELL`). Each triangle is cut out of what the earlier triangles have
+    left of its cell.
 
     Parameters
     ----------
@@ -778,7 +795,8 @@ def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygo
         # what no triangle of this round cuts remains as it is
         remainder = remainder.select(~has_triangle).concatenate_with(cut_polygons.select(~is_cut))
         # of the others the parts outside the triangle remain: one outside its first side, one
-        # inside that but outside the second, one inside both but outside the third
+        # inside that but outside the second, one inside both but outside the third. The inside is
+        # to the left of the way from a to b
         a, b = oriented_sides(cutting.corners[is_cut])
         inside = cut_polygons.select(is_cut)
         for k in range(3):

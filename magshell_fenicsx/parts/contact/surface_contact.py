@@ -72,7 +72,7 @@ from magshell_fenicsx.parts.gap import SOFT_PENETRATION, penalty
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Penalty = tuple[Array, Array, Array]
+Penalty = tuple[Array, Array, Array]  # (m,) psi, psi' and psi'' of joined places, by penetrations
 SEARCH_REACH = 4.0  # thicknesses: places farther than that are not looked for
 PATTERN_REACH = 1.0  # thicknesses: cells nearer than that have entries in the sparsity pattern
 FULL_CONTACT_SHARE = 1 - 1e-9  # of a cell's area, but for rounding
@@ -140,11 +140,19 @@ class SurfaceContact(ContactTerm):
     cuts
         The number of the cuts at present; 0 stands for those of the undeformed surfaces.
 
-    Private fields keep the last active set: `_at` is its displacement, `_growth` the natural
-    stretch there, and `_points` are the contact points with the present cuts. `_places` and
-    `_joined` have the places in contact, and `_places_left_to_edges` those that do not count.
-    `_cuts` makes and remembers cuts, and `_frozen` is a frozen contact that replaces the search.
-    `_reach` is the largest distance that is looked for.
+    Private fields of the model: `_cells` are the cells of all ranks and images, `_r0` (nodes, 3)
+    their undeformed places, and `_h` the thickness. `_nodes_of_pair` are the numbers of the nodes
+    of both members. `_components` is the number of unknowns of a node: 3, or 4 with the offset H.
+    `_rule` has the contact points of uncut cells, `_segments` gives those of cut cells, and `_cuts`
+    remembers the cuts of each number. `_search` finds the places of points, up to the distance
+    `_reach`. `_frozen` is a frozen contact that replaces the search.
+
+    Private fields of the last active set: `_at` is its displacement, `_growth` the natural stretch
+    there, and `_points` are the contact points with the present cuts. `_places` and `_joined` have
+    the places in contact, and `_places_left_to_edges` those that do not count. Of joined places
+    `first` (m,) is the row of the nearest place of each, and `group` (n,) is the number of the
+    joined place to which each place belongs. `_active_sets`, `_cell_values` and `_cached_entries`
+    are caches.
     """
 
     def __init__(self, pair: Pair, geometry: ContactGeometry, sides: tuple[Flags, Flags]) -> None:
@@ -186,27 +194,30 @@ class SurfaceContact(ContactTerm):
     def history(self) -> dict[str, tuple[StateNumber, float]]:
         """The numbers that a state sets, with defaults: penalty stiffness and number of the cuts.
 
-        See `FiniteElementSystem`. A state without a number of its own has the cuts of the
-        undeformed surfaces.
+        A state without a number of its own has the cuts of the undeformed surfaces.
         """
         return super().history | {self.pair.cuts: (self.cuts, 0.0)}
 
     def energy(self) -> float:
         """Return the energy of this rank's points over E h R^2."""
         places, joined_places, (value, _, _) = self._active_set()
+        # the area of each joined place is that of its point; half, since the points of the other
+        # surface have the same contact
         return float(self._points.weight[places.point[joined_places.first]] @ value) / 2
 
     def _entries(self) -> Entries:
         """Return this rank's entries of the tangent by the displacement; collective.
 
-        They are cached at the present state. At a sample of a step in time they are computed.
+        Those of the present state are cached. Those of a sample of a step in time are not.
         """
         places, *_ = self._active_set()
         cached_places, cached_stiffness, cached = self._cached_entries
         if cached_places is places and cached_stiffness == self.stiffness.value and not self.sample:
             return cached
         entries = self._entries_by_place_and_offset()
-        if self._offsets:  # to derivatives by the displacement alone, on which offsets depend
+        if self._offsets:
+            # offsets depend on the displacement: by the chain rule, which needs the derivative of
+            # the energy by offsets, the entries become those by the displacement alone
             by_offset = self._forces()[:, 3]
             entries = self._offsets.entries(self._at, entries, by_offset)
         if not self.sample:
@@ -215,28 +226,31 @@ class SurfaceContact(ContactTerm):
 
     @property
     def pattern_key(self) -> float:
-        """The number of the cuts, by which the sparsity pattern is known; see `NonlocalTerm`."""
+        """The number of the cuts: where it changes, the sparsity pattern is made again."""
         return self.cuts.value
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
         """Return pairs of nodes between which the tangent may have entries; collective.
 
-        They are the nodes of cells that touched, or nearly did, where the cuts were made. See
-        `NonlocalTerm`.
+        They are the nodes of cells that touched, or nearly did, where the cuts were made.
         """
-        self._active_set()
+        self._active_set()  # which sets `_points` to those of the present cuts
         u = self._cuts.displacement(self.cuts.value)
-        # the quotient is the largest thickness of the pair, since `_reach` is h plus
-        # (`SEARCH_REACH` - 1) times that
+        # `_reach` is h plus (`SEARCH_REACH` - 1) times the largest thickness of the pair: from that
+        # a smaller reach is computed
         reach = self._h + PATTERN_REACH * (self._reach - self._h) / (SEARCH_REACH - 1)
-        places = self._search.projections_in_cells(
-            self._points, u, self._search.places_of_nodes(u), reach
-        )
+        positions = self._search.places_of_nodes(u)
+        places = self._search.projections_in_cells(self._points, u, positions, reach)
         # each pair of a point's cell and the cell of its place once
         keys = np.unique(self._pair_keys(places))
         cell, faced_cell = np.divmod(keys, len(self._cells.nodes))
+        # the nodes of both cells, and each of them with each
         nodes = np.concatenate([self._cells.nodes[cell], self._cells.nodes[faced_cell]], axis=1)
-        return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
+        rows, columns = pairs_of(nodes)
+        if not self._offsets:
+            return rows, columns
+        # an offset depends on the nodes of all cells around it, which are then coupled too
+        return self._offsets.coupled_pairs(rows, columns)
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
@@ -258,17 +272,20 @@ class SurfaceContact(ContactTerm):
         -------
         field, values
             The field and derivatives (own cells, functions, components) by its values; None for any
-            other name. See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+            other name, and for a thickness that does not vary.
         """
         field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
         if field is None:
             return None
         state = self._state()
         weights = EnergyWeights(self._of_copies(global_values(direction)), energy, force)
-        # derivatives in modelled cells or on modelled nodes, summed over all ranks
         if name == "thickness":
+            # derivatives (cells, functions) by the thickness in all cells, added to those in
+            # modelled cells, and summed over all ranks; then those of this rank's own cells
             by_thickness = self._comm.allreduce(self._in_modelled(by_factor(state, weights)))
             return field, by_thickness[self._fields.own, :, None]
+        # derivatives (nodes, 3) by undeformed places, in the same way; then each node's derivative
+        # is shared out among the cells that have the node
         forces = self._comm.allreduce(self._on_modelled(by_place(state, weights)))
         return field, self._fields.shared_by_cells(forces)
 
@@ -305,9 +322,9 @@ class SurfaceContact(ContactTerm):
         places, joined_places, (_, slope, curvature) = active_set
         if not len(places.point):
             return no_entries()
-        # derivatives of the penalty for each place. With the blur e the smooth minimum gives joined
-        # places (psi'/e) d,u d,u instead of psi'' d,u d,u; what products of different places add
-        # is in `_entries_of_joints`
+        # psi' and psi'' for each place. Where several places are joined by a smooth minimum with
+        # the blur e, psi'/e stands in place of psi''; the products of different places that are
+        # joined come below, from `_entries_of_joints`
         is_blurred = joined_places.several[joined_places.group]
         first = slope[joined_places.group]
         second = np.where(
@@ -318,13 +335,10 @@ class SurfaceContact(ContactTerm):
         # places in the same pair of cells follow one another
         order = np.argsort(self._pair_keys(places), kind="stable")
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
-        rows, columns, values = (
-            list(entries_of_blocks) for entries_of_blocks in zip(*blocks, strict=True)
-        )
         if joined_places.several.any():
-            joint_blocks = self._entries_of_joints(*active_set)
-            for entries_of_blocks, added in zip((rows, columns, values), joint_blocks, strict=True):
-                entries_of_blocks.append(added)
+            blocks.append(self._entries_of_joints(*active_set))
+        # all rows, all columns and all values of these entries
+        rows, columns, values = zip(*blocks, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _blocks(
@@ -335,7 +349,8 @@ class SurfaceContact(ContactTerm):
         Parameters
         ----------
         places
-            Places ordered by pairs of cells, see `_pair_keys`.
+            Places in an order in which those of the same pair of cells follow one another; a pair
+            has the point's cell and the place's cell.
         weight, first, second
             (n,) weights, and first and second derivatives of the penalty by the penetration.
         """
@@ -349,13 +364,14 @@ class SurfaceContact(ContactTerm):
             # a chunk ends where the first pair of cells of the next one begins
             later = starts[np.searchsorted(starts, starts_of_chunk[-1]) + 1 :]
             chunk = slice(starts_of_chunk[0], later[0] if len(later) else len(keys))
-            # a Hessian for each place of the chunk
+            # a Hessian (dofs, dofs) for each place of the chunk, by the nodes of both cells
             chunk_places = places.select(chunk)
             geometry = self._geometry(chunk_places)
             *_, nodes = geometry
             penalties = weight[chunk], first[chunk], second[chunk]
             H = gap_hessians(self._cells, chunk_places, geometry, positions, penalties)
-            # their sum for each pair of cells, and the unknowns of its rows and columns
+            # their sum for each pair of cells, whose places follow one another; `begins` are the
+            # rows of the first ones. Then the numbers of the unknowns of rows and columns
             begins = starts_of_chunk - starts_of_chunk[0]
             sums = np.add.reduceat(H, begins, axis=0)
             dofs = unknown_numbers(nodes[begins], len(self._r0), self._components)
@@ -369,10 +385,12 @@ class SurfaceContact(ContactTerm):
         """Return the entries of joined places, besides those of each place alone.
 
         They are (psi'' - psi'/e) D,u D,u, with the joined distance D and the blur e of its smooth
-        minimum. The active set is an argument, since to find it is collective, and joined places
-        may lie on one rank only.
+        minimum. The members of the active set are arguments: to find it is collective, and this is
+        called only on ranks that have joined places.
         """
         _, slope, curvature = penalties
+        # only joined places of several places matter; a place's share in D,u is its weight times
+        # the derivative of its own distance
         is_blurred = joined_places.several[joined_places.group]
         _, n, beta, nodes = self._geometry(places.select(is_blurred))
         slopes = joined_places.weight[is_blurred, None, None] * distance_slopes(
@@ -394,13 +412,14 @@ class SurfaceContact(ContactTerm):
     def force(self) -> float:
         """Return the integral of the contact pressure, over E h R; collective."""
         places, joined_places, (_, slope, _) = self._active_set()
-        # half, since the points of both surfaces have the same force
+        # areas of the points times pressures psi' of their joined places; half, since the points of
+        # both surfaces have the same force
         weight = self._points.weight[places.point[joined_places.first]]
         return float(self._comm.allreduce(float(weight @ slope / 2)))
 
     def least_gap(self) -> float:
         """Return the least gap over R; nan where no faces are within the reach. Collective."""
-        self._active_set()
+        self._active_set()  # which sets `_points` to those of the present cuts
         least_distance = self._search.least_distance(
             self._displacement(), self._reach, self._points
         )
@@ -418,8 +437,9 @@ class SurfaceContact(ContactTerm):
         It is 0 without contact. The thickness is the mean of those at the point and at its place.
         """
         places, *_ = self._active_set()
-        own_largest = 0.0
+        own_largest = 0.0  # of this rank
         if len(places.point):
+            # the mean undeformed thickness (n,) of each point and its place
             thickness = self._search.thickness(self._points, places)
             own_largest = float(((self._h - places.distance) / thickness).max(initial=0.0))
         return float(self._comm.allreduce(own_largest, MPI.MAX))
@@ -430,13 +450,14 @@ class SurfaceContact(ContactTerm):
         Without contact they are 0 and the origin.
         """
         places, *_ = self._active_set()
-        own_deepest = (0.0, np.zeros(3))
+        own_deepest = (0.0, np.zeros(3))  # penetration and place of the point, on this rank
         if len(places.point):
             deepest = int(places.distance.argmin())
             nodes = self._r0 + self._displacement()
             point = places.point[[deepest]]
-            x = self._search.places_of_points(self._points, nodes, point)[0]
+            (x,) = self._search.places_of_points(self._points, nodes, point)
             own_deepest = (float(self._h - places.distance[deepest]), x)
+        # the deepest of all ranks
         penetration, x = max(self._comm.allgather(own_deepest), key=lambda candidate: candidate[0])
         return float(penetration), np.asarray(x)
 
@@ -470,23 +491,19 @@ class SurfaceContact(ContactTerm):
         places, joined_places, (_, slope, _) = self._active_set()
         points, (first_cell, count) = self._points, self._local_cells
         nearest = places.select(joined_places.first)
-        _, normals = self._cuts.points(self.cuts.value, self._displacement())  # of cells at cuts
-        # half of the force of an edge alone acts on the cell that it faces; this cell may be on
-        # another rank, so its forces are summed over all ranks
-        is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
         force = points.weight[nearest.point] * slope  # in full: the mean pressure of this face
-        force_of_edges = np.bincount(
-            nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes)
-        )
-        force_on_modelled = self._in_modelled(force_of_edges.astype(np.float64)[:, None])[:, 0]
-        force_on_faced = self._comm.allreduce(force_on_modelled)[self._fields.own]
+        # whether each of these points is one of an edge that presses on a face alone, judged by
+        # the normals of cells where the cuts were made
+        _, normals = self._cuts.points(self.cuts.value, self._displacement())
+        is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
+        force_on_faced = self._force_on_faced_cells(nearest, force / 2 * is_edge_alone)
         # local numbers of the points' cells: own cells come first, then ghosts, without points
         local_cell = points.cell - first_cell
-        # the area of each cell; one of ghosts, as a divisor
+        # the area of each cell is the sum of its points; ghosts, which have none, get 1 as divisor
         area = np.ones(count)
         np.add.at(area, local_cell, points.weight)
         area[: len(np.unique(points.cell))] -= 1.0
-        # the forces on each cell: from edges that it faces, and of its own points
+        # the forces on each cell: from edges that press on it, and of its own points
         force_on_cells = np.zeros(count)
         force_on_cells[: len(force_on_faced)] = force_on_faced
         own_force = force * (1 - is_edge_alone / 2)
@@ -501,6 +518,23 @@ class SurfaceContact(ContactTerm):
         pressed_area, pressed_points = np.zeros(count), np.unique(nearest.point)
         np.add.at(pressed_area, local_cell[pressed_points], points.weight[pressed_points])
         return force_on_cells / area, gap, pressed_area > FULL_CONTACT_SHARE * area
+
+    def _force_on_faced_cells(self, nearest: Projections, force_of_edges: Array) -> Array:
+        """Return the forces (own cells,) that edges exert on the cells that they face; collective.
+
+        Such a cell may be on another rank, or an image of one: forces are summed over all ranks and
+        images.
+
+        Parameters
+        ----------
+        nearest
+            Nearest places of this rank's points.
+        force_of_edges
+            (n,) force at each place; 0 where no edge presses alone.
+        """
+        force_on_cells = np.bincount(nearest.cell, force_of_edges, len(self._cells.nodes))
+        force_on_modelled = self._in_modelled(force_on_cells.astype(np.float64)[:, None])[:, 0]
+        return np.asarray(self._comm.allreduce(force_on_modelled)[self._fields.own])
 
     def halves(self) -> tuple[Array, Array]:
         """Return half the thickness (nodes,) over R, undeformed and at present; collective."""
@@ -536,7 +570,8 @@ class SurfaceContact(ContactTerm):
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R at nodes that supports hold, at a displacement u (nodes, 3).
 
-        See `ClosestPointSearch.gap_at_supports`.
+        It is infinite if no faces overlap at these nodes, or if the thickness depends on the
+        displacement.
         """
         return self._search.gap_at_supports(supported_nodes, self._of_copies(u))
 
@@ -556,17 +591,20 @@ class SurfaceContact(ContactTerm):
     def images_pass_through(self, u: Array, v: Array) -> bool:
         """Return whether points pass through a surface on the straight way from u to v; collective.
 
-        Displacements (nodes, 3) are those of all cells, images included; see `passes_through`.
+        Displacements (nodes, 3) are those of all cells, images included. Mid-surfaces are looked at
+        in samples of the way, between which no point moves by more than a part of the thickness.
         """
         least_thickness = self.least_thickness(u, v)
         # motions that are the same for all points do not count
         motion = (v - u) - (v - u).mean(axis=0)
-        # twice, since two points may move in opposite directions
+        # number of parts of the way; twice the motion, since two points may move in opposite
+        # directions
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         if not self._search.come_near(u, v):
             return False
-        # both ends of the way are states, where surfaces have not passed through each other
+        # points pass through if mid-surfaces are very near at a sample between the parts; both ends
+        # of the way are states, where surfaces have not passed through each other
         for k in range(1, count):
             near_places = self._search.projections(
                 u + k / count * (v - u), CROSSING_DISTANCE * least_thickness, to_faces=False
@@ -591,8 +629,9 @@ class SurfaceContact(ContactTerm):
             (nodes, 3) displacement of the whole step, of all nodes.
         """
         places, joined_places, _ = self._active_set()
-        if self._offsets:  # faces also move as the thickness changes
+        if self._offsets:  # faces also move as the thickness changes, the last component
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
+        # derivatives of the distances by the unknowns of nodes
         _, n, beta, nodes = self._geometry(places)
         slopes = distance_slopes(n, beta, self._components)
         # increase of the penetration over the step: of each place, then the weighted mean of the
@@ -623,8 +662,9 @@ class SurfaceContact(ContactTerm):
         u = self._displacement()
         places, *_ = self._active_set()
         left_places = self._places_left_to_edges
-        # what would count if steepness were judged by the present normals, not those of the cuts:
-        # some places would no more, and some that are left to edges would
+        # steepness is judged by the normals where the cuts were made. With the present normals
+        # some places would no longer count, and some that are left to edges would: their force is
+        # astray
         normals = self._segments.normals(self._r0 + u)
         is_left = self._search.are_left_to_edges(self._points, places, normals)
         stays_left = self._search.are_left_to_edges(self._points, left_places, normals)
@@ -656,6 +696,7 @@ class SurfaceContact(ContactTerm):
 
     @property
     def _divisions(self) -> int:
+        """How often triangles in contact are divided with the present cuts."""
         return divisions_of(self.cuts.value)
 
     def _with_cuts_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Projections]:
@@ -670,13 +711,14 @@ class SurfaceContact(ContactTerm):
         """
         points, normals = self._cuts.points_at(u, divisions)
         places = self._search.projections(u, self._h, points)
+        # places on edges that a face's points see steeply do not count
         is_left = self._search.are_left_to_edges(points, places, normals)
         return points, places.select(~is_left)
 
     def recall_cuts(self, number: float) -> None:
         """Let a number stand for cuts at the present displacement; collective.
 
-        It may be the number of a run on other ranks.
+        The number may come from a run on another number of ranks.
         """
         self._cuts.recall(number, self._displacement())
 
@@ -685,14 +727,16 @@ class SurfaceContact(ContactTerm):
     ) -> float:
         """Return the share of the force on points that went astray; collective.
 
-        They face another cell than where the cuts were made, or their triangle is divided less
-        often than those in the zone of contact. Without any force on counted places the share is 1
-        if some force is astray, else 0.
+        Such points face another cell than where the cuts were made, or their triangle is divided
+        less often than those in the zone of contact. Without any force on the places the share is
+        1 if some force is astray, else 0.
 
         Parameters
         ----------
+        points, places
+            Contact points of this rank, and their places that count.
         changed
-            Further force of this rank that counts as astray, see `_force`.
+            Further force of this rank that counts as astray, in the measure of `_force`.
         """
         faces_another = points.faces[places.point] != places.cell
         is_coarse = points.divisions[places.point] < self._divisions
@@ -707,9 +751,10 @@ class SurfaceContact(ContactTerm):
 
         It is a measure to compare forces, in which each surface counts in full and not by half.
         """
-        nearest = places.select(places.firsts)
+        nearest = places.select(places.firsts)  # one place of each point and direction
         soft_penetration = SOFT_PENETRATION * self._h
-        pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft_penetration)[1]
+        penetrations = self._h - nearest.distance
+        _, pressures, _ = penalty(penetrations, self.stiffness.value, soft_penetration)
         return float(points.weight[nearest.point] @ pressures)
 
     def _near(self, u: Array) -> Projections:
@@ -718,9 +763,10 @@ class SurfaceContact(ContactTerm):
         Cells that are near within the surface are left out, as they are not cut.
         """
         # every place of a cell is within its cover distance of one of the cell's points
-        reach = self._h + self._segments.cover_distance
+        reach = self._h + self._segments.cover_distance  # (cells,)
+        positions = self._search.places_of_nodes(u)
         near_places = self._search.projections_in_cells(
-            self._rule, u, self._search.places_of_nodes(u), float(reach.max())
+            self._rule, u, positions, float(reach.max())
         )
         is_near = near_places.distance < reach[self._rule.cell[near_places.point]]
         return self._search.select_distant_cells(self._rule, near_places.select(is_near))
@@ -765,9 +811,10 @@ class SurfaceContact(ContactTerm):
             _, n, beta, nodes = self._geometry(places)
             # half, since the points of the other surface have the same contact
             weight = joined_places.weight * self._points.weight[places.point] / 2
-            pressure = weight * slope[joined_places.group]
+            force_of_places = weight * slope[joined_places.group]
+            # derivatives of the distances by the unknowns of nodes
             slopes = distance_slopes(n, beta, self._components)
-            np.add.at(forces, nodes, -pressure[:, None, None] * slopes)
+            np.add.at(forces, nodes, -force_of_places[:, None, None] * slopes)
         return forces
 
     def _active_set(self) -> tuple[Projections, JoinedPlaces, Penalty]:
@@ -780,7 +827,8 @@ class SurfaceContact(ContactTerm):
         # a frozen contact replaces the search
         if self._frozen:
             self._at, self._points = np.array(self._displacement()), self._frozen.points
-            # a held contact serves differences of tangents, which need the third order
+            # a contact that is held at one state (`hold` of the base class) serves differences of
+            # tangents, which need the penalty to the third order
             is_held = self.held is not None
             return self._frozen.evaluate(
                 self._search, self._at, self.stiffness.value, self._h, with_third_order=is_held
@@ -820,6 +868,7 @@ class SurfaceContact(ContactTerm):
             (nodes, 3) displacement over R.
         """
         places = self._search.projections(u, (1 + DISTANCE_TOLERANCE) * self._h, points)
+        # whether a point inside a face sees its place, on an edge, steeply
         is_left = self._search.are_left_to_edges(points, places, normals)
         counted = places.select(~is_left)
         joined_places = JoinedPlaces.join(counted, BLUR_DISTANCE * self._h)
@@ -841,7 +890,10 @@ class SurfaceContact(ContactTerm):
         self._frozen = frozen.on_surface(self._r0)
 
     def _geometry(self, places: Projections) -> tuple[Array, Array, Array, Longs]:
-        """Return distances, normals, and beta with its nodes for places, see `gap_geometry`."""
+        """Return the distances (n,), normals (n, 3), and beta with its nodes, for n places.
+
+        Beta (n, functions of both cells) are the point's shape functions, minus those of its place.
+        """
         return gap_geometry(self._cells, self._points, self._r0 + self._at, places)
 
 

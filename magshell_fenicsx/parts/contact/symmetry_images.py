@@ -55,6 +55,7 @@ class Images:
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """The sparse matrix P (3 copies count, 3 count): displacements of all copies are P u."""
+        # the displacement of each copy is a matrix (3, 3) times that of the model at each node
         matrices = [image.Q * (self.parity if image.sign < 0 else 1.0) for image in self.images]
         identity = scipy.sparse.eye_array(self.count)
         return scipy.sparse.vstack([scipy.sparse.kron(identity, Q) for Q in matrices]).tocsr()
@@ -107,7 +108,8 @@ class Images:
         # at first place i of copy k has the number k n + i
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
-            # the first of all copies is compared last: its number stays where several coincide
+            # where several images coincide, each has the number of the first: the earlier copies
+            # are compared from the last to the first, so that the first one's number stays
             for earlier in range(k - 1, -1, -1):
                 is_same = np.linalg.norm(places - images[earlier], axis=1) < tolerance
                 numbers[k, on_planes[is_same]] = numbers[earlier, on_planes[is_same]]
@@ -141,7 +143,7 @@ class ContactWithImages(SurfaceContact):
         The cells and nodes of all copies. All degrees of freedom of the copies count as those of
         this rank, since forces are first summed over all of them.
     sides
-        See `SurfaceContact`.
+        (cells,) flags of the cells of the first member of the pair, and of the second.
     """
 
     def __init__(
@@ -174,6 +176,7 @@ class ContactWithImages(SurfaceContact):
         b[:size] += self._images.sum_forces(of_copies)[start : start + size]
 
     def entries(self) -> Entries:
+        """Return the entries of the model's tangent, from those of all copies; collective."""
         return self._images.sum_entries(super().entries())
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
@@ -185,6 +188,7 @@ class ContactWithImages(SurfaceContact):
         return rows % self._images.count, columns % self._images.count
 
     def _of_copies(self, u: Array) -> Array:
+        """Return the displacement (copies count, 3) of all copies for that of the model."""
         return self._images.displacements(u)
 
     def _in_modelled(self, values: Array) -> Array:
@@ -196,4 +200,5 @@ class ContactWithImages(SurfaceContact):
         return np.asarray(values.reshape(copies, -1, values.shape[1]).sum(axis=0))
 
     def _on_modelled(self, forces: Array) -> Array:
+        """Return the forces (count, 3) on the model's nodes, from those on all copies."""
         return self._images.sum_forces(forces.ravel()).reshape(-1, 3)

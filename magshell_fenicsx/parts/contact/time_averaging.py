@@ -74,7 +74,7 @@ class StepSample:
         penalties
             (n,) the penalty and its first and second derivatives by the penetration.
         """
-        if self.first is None or self.second is None:  # a sample that only gives rates
+        if self.first is None or self.second is None:  # no factors: a sample that only gives rates
             return penalties
         value, first, second = penalties
         return value, self.first[point] * first, self.second[point] * second
@@ -119,7 +119,7 @@ class SampleRates:
             (n,) for each place: number of its point, penetration, and increase of the penetration
             along the whole way.
         k, soft_penetration
-            See `penalty`.
+            Stiffness of the penalty, which grows from zero to k over the soft penetration.
         """
         value, first, second = penalty(penetration, k, soft_penetration)
         # changes by rounding alone do not count, as they become divisors
@@ -215,31 +215,16 @@ def samples_of_step(
     part
         Position within the step, from 0 to 1, at which the system takes its forces.
     """
-    # the penalty of each point at the begin, in the middle and at the end of the way
+    # the penalty of each point, with its rates along the way, at the begin, in the middle and at
+    # the end
     displacements = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
     rates = list[SampleRates]()
     for u in displacements:
         contact.sample = StepSample(u)  # without factors
         rates.append(contact.sample_rates(end - begin))
     contact.sample = None
-    # work of Simpson's mean force, and its derivative by the end of the way
-    positions, weights = np.transpose(SIMPSON_RULE)
-    work = weights @ [sample_rates.rate for sample_rates in rates]
-    curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
-    # what both are to be at points that pass a kink, and the factors that make them so
-    is_kink = np.any(
-        [earlier.segment != later.segment for earlier, later in pairwise(rates)], axis=0
-    )
-    energy_change = rates[-1].value - rates[0].value
-    end_slope = rates[-1].rate - energy_change
-    force_factor = _factor(energy_change, work, is_kink)
-    slope_factor = _factor(end_slope, curvature, is_kink)
-    # a point that opens has no contact in the middle and at the end. Its force depends on the end
-    # of the way only by the length of the way; the sample at the begin has this derivative
-    is_opening = is_kink & (curvature == 0)
-    opening_factor = (
-        np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0) / part
-    )
+    force_factor, slope_factor, factor_at_begin = _kink_factors(rates)
+    opening_factor = factor_at_begin / part
     off_middle = part - 0.5
     samples = list[StepSample]()
     for u, (position, weight) in zip(displacements, SIMPSON_RULE, strict=True):
@@ -256,6 +241,43 @@ def samples_of_step(
             )
         )
     return samples
+
+
+def _kink_factors(rates: Sequence[SampleRates]) -> tuple[Array, Array, Array]:
+    """Return factors (points,) that correct Simpson's mean force where it passes a kink.
+
+    At such points the work of the mean force is to be the change of the energy. The derivative by
+    the end of the way is to be that of this change, less that of the way's length.
+
+    Parameters
+    ----------
+    rates
+        The penalty of each point at the begin, in the middle and at the end of the way.
+
+    Returns
+    -------
+    force_factor, slope_factor
+        Factors of the force, and of its derivative by the end of the way; 1 without a kink.
+    factor_at_begin
+        Factor of the derivative at the begin, for points that open; 0 for all others.
+    """
+    # work of Simpson's mean force, and its derivative by the end of the way
+    positions, weights = np.transpose(SIMPSON_RULE)
+    work = weights @ [sample_rates.rate for sample_rates in rates]
+    curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
+    # what both are to be at points that pass a kink
+    is_kink = np.any(
+        [earlier.segment != later.segment for earlier, later in pairwise(rates)], axis=0
+    )
+    energy_change = rates[-1].value - rates[0].value
+    end_slope = rates[-1].rate - energy_change
+    force_factor = _factor(energy_change, work, is_kink)
+    slope_factor = _factor(end_slope, curvature, is_kink)
+    # a point that opens has no contact in the middle and at the end. Its force depends on the end
+    # of the way only by the length of the way; the sample at the begin has this derivative
+    is_opening = is_kink & (curvature == 0)
+    factor_at_begin = np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0)
+    return force_factor, slope_factor, factor_at_begin
 
 
 def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
@@ -307,10 +329,13 @@ class ContactTerm:
     ----------
     stiffness
         Stiffness k of the penalty, over E h/R^2.
-    samples, sample
-        See `TimeAveragedContact`.
+    samples
+        The samples of a step in time; empty while the contact has the force of the present state.
+    sample
+        The sample at which the contact is evaluated now; None for the present state.
     held
-        The frozen contact that stands for all states, see `hold`; None without.
+        The frozen contact of one state that replaces the search in all states; None without. It is
+        set by `hold`.
     pair, name, group
         The two members, and the name of the term, which is also that of its group.
     amplitude, column
@@ -353,13 +378,14 @@ class ContactTerm:
             The result of `freeze` at one state.
         """
         self.held = self._frozen = None
-        # `expand_about` alone is for another scene's contact, which is not held
+        # `expand_about` sets `_frozen`; called by itself it serves another scene's contact, and
+        # then `held` stays None
         if frozen is not None:
             self.expand_about(frozen)
             self.held = frozen
 
     def expand_about(self, frozen: Any) -> None:
-        """Use the frozen contact of another scene on the same mesh, see `frozen_contact`."""
+        """Use the active set of another scene on the same mesh, fixed, for all later states."""
         raise NotImplementedError
 
     @property
@@ -393,14 +419,16 @@ class ContactTerm:
     def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
         """Return the free parameters on which the faces depend, with this term's derivatives.
 
-        Only the natural stretch moves faces, through the thickness of a shell that has grown.
+        Only the natural stretch moves faces, through the thickness of a shell that has grown. The
+        result has this parameter alone, with the contact forces added to its derivatives; it is
+        empty where nothing grows.
 
         Parameters
         ----------
         parameters
             Name -> number that varies in the energies.
         """
-        amplitude = self._offsets.amplitude if self._offsets else None
+        amplitude = self._offsets.amplitude if self._offsets else None  # the natural stretch
         return {
             name: with_growth(p, self._state, self._add)
             for name, p in parameters.items()
@@ -408,8 +436,11 @@ class ContactTerm:
         }
 
     def _on_nodes(self, forces: Array) -> Array:
-        """Return the forces by the displacement (nodes, dim), of those by places and H."""
-        # `_at` has been the displacement of the forces since they were computed
+        """Return the derivative (nodes, dim) by the displacement, from that by places and H.
+
+        H depends on the displacement.
+        """
+        # `_forces` has set `_at` to its displacement
         return forces_on_nodes(self._offsets, self._at, forces)
 
     def _forces(self) -> Array:

@@ -267,6 +267,15 @@ class DeadSection(PathStep):
         """Return the first change of the factor: an equal part of the way to a target factor.
 
         Towards a target displacement it is 1e-3.
+
+        Parameters
+        ----------
+        change
+            The whole change to the target, of the factor or of the displacement.
+        load_start
+            Not used here: the amplitude where the step begins.
+        by_load
+            Whether the target is one of the factor.
         """
         return change / self.points if by_load else copysign(1e-3, change)
 
@@ -287,7 +296,7 @@ class DeadSection(PathStep):
         """
         length = context.shell.reference
         constant_loads = [load for load in self.loads if not load.varies]
-        # vectors and places that a mirror plane must contain
+        # vectors and places that a mirror plane must contain; then all of them as unit vectors
         forces = [
             np.array(v)
             for load in constant_loads
@@ -296,26 +305,34 @@ class DeadSection(PathStep):
         ]
         places = [np.array(context.points[load.at]) / length for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
-        # only formulas are compared at sampled places
+        # places of the undeformed shell (n, 3), at which formulas are compared; without formulas
+        # none are needed
         potentials = [load.potential for load in self.loads if load.potential]
         has_formulas = potentials or len(constant_loads) < len(self.loads)
         sampled_places = outline.sample() if has_formulas else np.zeros((0, 3))
 
         def mirrors(mirror: Mirror) -> bool:
-            """Return whether a mirror plane maps the loads to each other."""
-            on_plane = all(abs(float(mirror.signed_distance(place))) < ROUNDING for place in places)
-            in_potentials = on_plane and all(
+            """Return whether a mirror plane maps the loads to each other.
+
+            Loaded points must be on it, potentials must be the same on both sides, and the image of
+            each load must be one of the loads.
+            """
+            has_points = all(
+                abs(float(mirror.signed_distance(place))) < ROUNDING for place in places
+            )
+            keeps_potentials = has_points and all(
                 mirrors_formula(text, mirror, sampled_places, length) for text in potentials
             )
-            return in_potentials and all(
-                any(is_image(a, b, mirror, sampled_places, length) for b in self.loads)
-                for a in self.loads
+            return keeps_potentials and all(
+                any(is_image(load, other, mirror, sampled_places, length) for other in self.loads)
+                for load in self.loads
             )
 
         reason = self._reason_against_turns(vectors, outline.meridian, length)
-        # each potential finds its symmetry by itself, as an energy of the case's frame
+        # each potential finds its symmetry by itself, as an energy in the case's frame
+        case_frame = np.eye(3)
         energies = [
-            potential(f"potential_{i}", text, np.eye(3), context.scales)
+            potential(f"potential_{i}", text, case_frame, context.scales)
             for i, text in enumerate(potentials)
         ]
         return [
@@ -337,7 +354,8 @@ class DeadSection(PathStep):
         length
             Length R in the unit of the formulas' places.
         """
-        # formulas are looked at on a meridian alone
+        # whether formulas are the same all around e3; that is known on a meridian alone, and else
+        # taken to be so
         is_axisymmetric = not meridian or (
             all(load_turns(load, meridian, length) for load in self.loads if load.varies)
             and all(
@@ -348,7 +366,8 @@ class DeadSection(PathStep):
         )
         if any(tilted(v) for v in vectors):
             return "a load is not along e3, or off the axis"
-        # parts that are the same all around e3: all, and each shell of several on meridians
+        # `over` names a part that is the same all around e3 if it is "all", or one shell of several
+        # on meridians
         shell_names = [shell.name for shell in meridian.shell_meridians] if meridian else []
         if any(load.over not in (None, "all", *shell_names) for load in self.loads):
             return "a patch is loaded"
@@ -363,14 +382,18 @@ class DeadSection(PathStep):
     ) -> list[Feature]:
         """Return the disc of small elements around a loaded point in the chart."""
         x, y = map(float, place)
+        # how fast elements grow with the distance; the disc has no radius, so that they grow from
+        # the point on
         growth = loads[0].growth(sizing)
-        # of no radius: elements grow from the point on
         return [DiscFeature((x, y), radius=0.0, size=sizing.h, growth=growth)]
 
     def largest(self, sizing: SizingContext) -> float | None:
-        """Return the largest size of elements over R, 2 sqrt(h/R) for thin shells; else None."""
-        size = 2 * sqrt(sizing.h)
-        return size if size < 0.35 else None  # of a thick shell no bound
+        """Return the largest size of elements over R: 2 sqrt(h/R) of a thin shell.
+
+        It is None of a thick shell, which has no bound of its own.
+        """
+        size = 2 * sqrt(sizing.h)  # h is over R
+        return size if size < 0.35 else None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
         """Yield the keys of all loads that may be formulas, with bounds and unit of places.
@@ -389,13 +412,13 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
-                # the model's largest load in the case's units: of E h on an edge, else of E h/R
+                # the model's largest load in the case's units: over E h on an edge, else over E h/R
                 divisor = scales.R if name != "per_length" else 1.0
                 largest = MAX_COMPONENT * (scales.E * scales.h / divisor)
                 yield Formulas(
                     f"{key}.loads.{i}.{name}", values, -largest, largest, scales.R, load=True
                 )
-            if load.potential:  # of the deformed place: the undeformed one is looked at
+            if load.potential:  # a formula of the deformed place, checked at undeformed places
                 largest = MAX_COMPONENT * scales.E * scales.h
                 yield Formulas(
                     f"{key}.loads.{i}.potential",
@@ -447,13 +470,13 @@ def is_normal(components: Sequence[Varying], outline: "Outline", length: float) 
     length
         Length R in the unit of the formulas' places.
     """
-    sampled = outline.samples_with_normals()
+    sampled = outline.samples_with_normals()  # (n, 3) places over R, and unit normals there
     if sampled is None:  # normals are not known
         return False
     places, normals = sampled
     load = np.stack([formula_function(v)(*(length * places).T) for v in components], axis=-1)
     largest_tangential = np.linalg.norm(np.cross(load, normals), axis=1).max()
-    # on a plane one direction is along all normals, and no pressure of a fluid is meant
+    # on a plane any load along the one normal would pass, though no pressure of a fluid is meant
     is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
     return bool(
         is_curved and largest_tangential < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max()
@@ -472,9 +495,9 @@ def is_image(
     R
         Length of the shell in the unit of formulas' places.
     """
-    if load.varies or other.varies:  # values of formulas are compared at places
-        return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
-    # what has no direction must be the same, and edges must be images of each other
+    if load.varies or other.varies:  # values of formulas are compared at places and their images
+        return _mirrored_formula(load, other, mirror, x=R * x, image=R * mirror.image(x))
+    # points, patches, moments and pressures must be the same, and edges images of each other
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
@@ -507,6 +530,7 @@ def _mirrored_formula(
     x, image
         (n, 3) places and their mirror images, in the unit of formulas.
     """
+    # both must be vectors, or both pressures, on edges that are images or over the same part
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False

@@ -129,7 +129,7 @@ class IndentationSection(PathStep):
             raise CaseError(
                 f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}"
             )
-        # `highest` is the chart of the pole, centre or tip
+        # `highest` has the chart coordinates (2,) of the pole, centre or tip; None without one
         if outline.highest is None or not (outline.disc or geometry == "strip"):
             raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
         if not outline.sphere:
@@ -138,8 +138,8 @@ class IndentationSection(PathStep):
             raise CaseError(
                 f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole"
             )
-        # in the chart: the polar angle along the azimuth. 1e-300 is for the pole itself, where the
-        # azimuth has no meaning: the quotient is zero
+        # chart coordinates: the polar angle times the unit vector of the azimuth. At the pole that
+        # vector is 0/0, and 1e-300 makes it zero
         chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
         return np.asarray(outline.embedding(chart[None])[0])
 
@@ -168,8 +168,8 @@ class IndentationSection(PathStep):
         CaseError
             With the radii that are allowed, over h.
         """
-        # over R: on a sphere it is known; elsewhere the edge is taken to be 1 away, of a strip its
-        # width if that is less
+        # distance over R from the place to the edge. On a sphere it is known. Elsewhere it is taken
+        # to be 1, or the width of a strip if that is less
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         distance_to_edge = (
             outline.edge - float(np.hypot(*chart_place[:2]))
@@ -199,15 +199,20 @@ class IndentationSection(PathStep):
             Coordinates of the place in the chart.
         """
         h, (x, y) = sizing.h, map(float, place)
-        # the smallest patch and the largest dent; ten thicknesses are assumed without a depth
+        # the smallest patch and the largest depth, over h; without a depth ten thicknesses are
+        # assumed
         patch = min(load.patch for load in loads)
         depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
-        # the radius of the dent: the ridge's radius times a factor by experience, and a margin
-        dent = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
+        # the radius of the disc over R: the ridge's radius times a factor by experience, and a
+        # margin
+        dent_radius = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
         growth = loads[0].growth(sizing)
-        # finer than h the point force's logarithmic stretch would be resolved, which has no limit
+        # elements at the patch are not finer than h: else they would resolve the stretch under a
+        # point force, which is logarithmic and has no limit
         return [
-            DiscFeature((x, y), radius=dent, size=sqrt(h) / sizing.refinement, growth=growth),
+            DiscFeature(
+                (x, y), radius=dent_radius, size=sqrt(h) / sizing.refinement, growth=growth
+            ),
             DiscFeature((x, y), radius=patch * h, size=max(patch * h / 2, h), growth=growth),
         ]
 
@@ -236,10 +241,17 @@ class IndentationSection(PathStep):
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the first change of the force, in its unit 2 pi D/R.
 
-        Towards the top of an energy barrier it is small. Under a prescribed force it is an equal
-        part of the way, otherwise one.
+        Towards the top of an energy barrier, where the force is zero again, it is small. Under a
+        prescribed force it is an equal part of the way, otherwise one.
+
+        Parameters
+        ----------
+        change
+            The whole change to the target, of the force or of the displacement.
+        load_start, by_load
+            Not used here: the force where the step begins, and whether the target is a force.
         """
-        if self.until == "zero":  # the other end of an energy barrier
+        if self.until == "zero":  # up to the top of an energy barrier
             return LEAST_HUMP
         return change / self.points if self.control == "load" else copysign(1.0, change)
 

@@ -180,11 +180,12 @@ def point_entries(
     cells
         Flags of the local cells that may have the vertex; None for all.
     """
-    # nodes at the place, which may be several where sheets meet; numbers are those of blocks of 3
-    dofs_at_x = fem.locate_dofs_geometrical(
+    # numbers of the nodes at the place, which may be several where sheets meet; each has three
+    # degrees of freedom
+    nodes_at_x = fem.locate_dofs_geometrical(
         V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9
     )
-    owned = dofs_at_x[dofs_at_x < V.dofmap.index_map.size_local]
+    owned = nodes_at_x[nodes_at_x < V.dofmap.index_map.size_local]
     if cells is not None:
         owned = owned[np.isin(owned, V.dofmap.list[cells])]
     load_dofs = (3 * owned[:, None] + np.arange(3)).ravel().astype(np.int32)
@@ -227,6 +228,7 @@ def patch_entries(
     domain = V.mesh
     centre, patch_radius = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
+    # `smooth` is the weight of the patch; times undeformed area per area of the flat mesh
     weight = smooth(r0 - centre, patch_radius) * kin.area_ratio(kin.jet(r0, domain))
     # on other sheets near the point the weight is zero
     weight = weight if cells is None else weight * patch_indicator(domain, cells)
@@ -247,6 +249,7 @@ def vertex_normal(
     cells
         Flags of the local cells that count; None for all.
     """
+    # flags of the cells' corners at the vertex, and both tangents at all corners
     _, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
     # a1 x a2 is twice a triangle's area along its normal
     area_vector = r0.function_space.mesh.comm.allreduce(
@@ -258,8 +261,8 @@ def vertex_normal(
 def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None = None) -> Array:
     """Return derivatives (own cells, nodes, 3) of v . n by the places of nodes; collective.
 
-    n is the unit normal of the mid-surface at the vertex x, see `vertex_normal`. Each cell has its
-    part of a node's derivative, which is their sum.
+    n is the unit normal of the undeformed mid-surface at the vertex x: the mean of its triangles'
+    normals, weighted by areas. The derivative by a node is the sum over the cells with this node.
 
     Parameters
     ----------
@@ -268,7 +271,8 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None 
     cells
         Flags of the local cells that count; None for all.
     """
-    table, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
+    # derivatives of shape functions at corners, flags of the corners at the vertex, and tangents
+    gradients, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
     area_vector = r0.function_space.mesh.comm.allreduce(
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
@@ -278,11 +282,18 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None 
     # p . (a1 x a2) has the gradients a2 x p by a1, and p x a1 by a2
     by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
     # by nodes k: sums over both tangents d and all corners v of cell c
-    return np.asarray(np.einsum("dvk,dcvi->cki", table, by_tangents))
+    return np.asarray(np.einsum("dvk,dcvi->cki", gradients, by_tangents))
 
 
 def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, Inside, Array]:
     """Return shape function gradients, flags of corners at a vertex, and tangents at corners.
+
+    Parameters
+    ----------
+    x
+        Place (3,) of the vertex in the mesh's geometry.
+    cells
+        Flags of the local cells that count; None for all.
 
     Returns
     -------
@@ -322,8 +333,8 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         The case around the load, and the part of the shell that is modelled.
     """
     mirror = modelled.mirror
-    # the copies share a force, but not on an edge whose image is another edge: there each copy has
-    # a force of its own
+    # the copies share a force on the whole shell; but on an edge whose mirror image is another edge
+    # there is only the force of that edge, which stays whole
     is_shared = mirror is not None and (
         load.edge is None or mirror.image_of_edge(load.edge) == load.edge
     )
@@ -334,13 +345,13 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         return Potential(potential(name, load.potential, Q, scales))
     if load.varies:
         load_unit = E * thickness if load.edge else E * thickness / R  # per length, or per area
-        pattern = _pattern(load, Q, R, 1 / load_unit)
+        pattern = _pattern(load, Q, length=R, factor=1 / load_unit)
         return (
             EdgeForce(load.edge, pattern, total=False)
             if load.edge
             else AreaForce(_patch_of_load(load), pattern)
         )
-    # at a point or on an edge: only a load with `force` has it, else it is zero and not used
+    # at a point or on an edge; `force` is zero, and not used, for a load that has no force
     share = 1 / mirror.copies if mirror and is_shared else 1.0
     force = np.asarray(share * (Q @ (load.force or np.zeros(3))) / (E * thickness * R))
     if load.at is not None:
@@ -394,11 +405,11 @@ def account(context: Context, loads: Loads) -> Account:
 
     Without forces it lists them as left out.
     """
-    # radii over h
-    patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
+    # radii of patches over h, 0 for a point
+    radii = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
     lines = [
-        f"force on a patch of radius {patch:g} h" if patch else "force at a point"
-        for patch in patches
+        f"force on a patch of radius {radius:g} h" if radius else "force at a point"
+        for radius in radii
     ]
     if dead := loads.all_dead:
         lines.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
@@ -460,19 +471,34 @@ class DeadLoads:
 class _DeadLoadSum:
     """The sum of dead loads while it is made; all methods are collective.
 
+    Parameters
+    ----------
+    V
+        Space of the displacement.
+    measures
+        The points, edges and areas on which loads act.
+    log
+        Compiles forms.
+
     Attributes
     ----------
     parts
         Entries of the load vector of each load.
-    size, densities, sizes
-        See `DeadLoads`; `densities` is `spread` there.
+    size
+        The sum of the loads' sizes over E h R. The size of a distributed load is the integral of
+        its density's length.
+    densities
+        For each distributed load its density (3,), its measure, and whether the density is a total
+        force divided by the length of its edge.
+    size_forms
+        Parts of `size` as forms, where it depends on the undeformed placement.
     """
 
     def __init__(self, V: fem.FunctionSpace, measures: Measures, log: KernelLog) -> None:
         self._V, self._measures, self._log = V, measures, log
         self.parts, self.size = list[Entries](), 0.0
         self.densities = list[tuple[Expr, Weighted, bool]]()
-        self.sizes = list[ufl.Form]()
+        self.size_forms = list[ufl.Form]()
 
     def add(self, load: DeadLoad) -> None:
         """Add a load to the sum; moments and potentials have no load vectors."""
@@ -492,11 +518,11 @@ class _DeadLoadSum:
         if callable(load.force):  # a pattern
             self._add_pattern(load.force, ds, load.edge)
             return
-        length = ds.total(self._V, self._log)
-        force = np.asarray(load.force / length) if load.total else load.force
-        strength = float(np.linalg.norm(force))
-        self._add_density(self._constant(force), ds, strength, is_total=load.total)
-        self.size += strength * length
+        edge_length = ds.total(self._V, self._log)
+        force_per_length = np.asarray(load.force / edge_length) if load.total else load.force
+        strength = float(np.linalg.norm(force_per_length))
+        self._add_density(self._constant(force_per_length), ds, strength, is_total=load.total)
+        self.size += strength * edge_length
 
     def _add_area_force(self, load: AreaForce) -> None:
         """Add a force per area: a pressure against the normal, a vector, or a pattern."""
@@ -523,13 +549,15 @@ class _DeadLoadSum:
         edge
             Name of its edge; None for a surface.
         is_part
-            Whether it is on a patch: the integral that the pattern knows is over all the surface.
+            Whether it is on a patch, and not on all of the surface.
         """
-        density, known_size = self._measures.field(pattern, edge)
+        # the pattern as a field; for some patterns the integral of its length over all of the
+        # surface or edge comes with it, else None
+        density, integral_over_all = self._measures.field(pattern, edge)
         strength = ufl.sqrt(ufl.dot(density, density))
         self._add_density(density, measure, strength)
-        if known_size is not None and not is_part:
-            self.size += known_size
+        if integral_over_all is not None and not is_part:
+            self.size += integral_over_all
             return
         form = self._log.compile("load size", strength * measure)
         self.size += float(self._V.mesh.comm.allreduce(fem.assemble_scalar(form)))
@@ -551,7 +579,7 @@ class _DeadLoadSum:
         self.densities.append((density, measure, is_total))
         if not is_total:
             strength_form = self._constant(strength) if isinstance(strength, float) else strength
-            self.sizes.append(strength_form * measure)
+            self.size_forms.append(strength_form * measure)
 
     def _constant(self, value: float | Array) -> fem.Constant:
         return fem.Constant(self._V.mesh, value)
@@ -570,7 +598,7 @@ def assemble_dead_loads(
         np.add.at(vector, dofs, values)
     dofs = np.flatnonzero(vector).astype(np.int32)
     entries = dofs, vector[dofs]
-    return DeadLoads(entries, load_sum.size, load_sum.densities, load_sum.sizes)
+    return DeadLoads(entries, load_sum.size, load_sum.densities, load_sum.size_forms)
 
 
 def patch_indicator(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
@@ -593,8 +621,12 @@ class SurfaceMeasures:
     ----------
     r0
         Undeformed placement over R.
+    midsurface
+        The mesh with its edges, patches and points by name.
     degree
         Degree of the placement.
+
+    The field `_j0` is the jet of the placement: itself with its derivatives.
     """
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
@@ -610,7 +642,8 @@ class SurfaceMeasures:
         tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
         # two degrees more, as lengths and formulas along the edge are no polynomials
         rule = {"quadrature_degree": edge_quadrature(self._degree) + 2}
-        ds = ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=rule)(1)
+        ds = ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=rule)(1)  # the tag 1
+        # undeformed length of the edge per length of the flat mesh's edge
         *_, length_ratio = kin.conormal(self._j0, kin.facet_covector(domain))
         return Weighted(length_ratio, ds)
 
@@ -624,7 +657,10 @@ class SurfaceMeasures:
         return Weighted(weight, dx)
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        """Return a pattern as a field, and the integral of its size, see `Measures`."""
+        """Return a pattern as a field, and the integral of its length if that is known, else None.
+
+        The field is on the surface, or on a named edge. Collective.
+        """
         if edge is None:
             return pattern_field(pattern, self._r0, ADDED_LOAD_DEGREE)
         return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], ADDED_LOAD_DEGREE)

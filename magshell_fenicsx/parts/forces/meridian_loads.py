@@ -48,7 +48,8 @@ class RevolutionIntegrals:
     meridian, domain
         The meridian, and the integrals of its forms.
     parts, measures
-        Facets of ends and points, and the measure of each within one measure of the boundary.
+        The facets of each end or point that is loaded, and the measure of each within one measure
+        of the boundary.
     """
 
     meridian: Meridian
@@ -77,21 +78,24 @@ class RevolutionIntegrals:
 
     def _ds(self, facets: Facets) -> ufl.Measure:
         """Return the measure of facets: that of the part with them, or else one of their own."""
-        pairs = zip(self.parts, self.measures, strict=True)
-        return next(
-            (ds for part, ds in pairs if np.array_equal(part, facets)), None
-        ) or self.domain.ds(facets)
+        for part, ds in zip(self.parts, self.measures, strict=True):
+            if np.array_equal(part, facets):
+                return ds
+        return self.domain.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
-        """Return the integral along the undeformed circle of a named end.
+        """Return the integral along the undeformed circle of a named end, per radian: f rho.
 
-        With `mean` it is the mean there, over 2 pi, as integrals are per radian.
+        With `mean` it is the mean f of the circle over 2 pi, so that 2 pi times it is the mean.
         """
         ds = self._ds(self.meridian.ends[name])
         return lambda f: f / (2 * np.pi) * ds if mean else f * self.domain.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
-        """Return the value at a named point on the axis, over 2 pi."""
+        """Return the "integral" over a named point on the axis: the value there, over 2 pi.
+
+        All around the axis, that is times 2 pi, it is the value itself.
+        """
         ds = self._ds(self.meridian.facets_at(point))
         return lambda f: f / (2 * np.pi) * ds
 
@@ -112,7 +116,8 @@ class RevolutionIntegrals:
         a = self.domain.constant(radius)
         pole = self.domain.constant(self.meridian.section(parameter)[0])
         depth = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
-        weight, integral = ufl.conditional(ufl.gt(depth, 0), depth**2, 0), self.domain.over_area()
+        weight = ufl.conditional(ufl.gt(depth, 0), depth**2, 0)
+        integral = self.domain.over_area()
         return lambda f: integral(weight * f)
 
 
@@ -122,8 +127,7 @@ def dead_loads(
     """Return the energy of dead loads without moments, the sum of their sizes, and its forms.
 
     Vectors are along e3, and points are on the axis. The size of a force is its length, that of a
-    distributed load the integral of its density's length; forms of the sizes show how the sum
-    depends on the placement.
+    distributed load the integral of its density's length.
 
     Parameters
     ----------
@@ -131,49 +135,81 @@ def dead_loads(
         Name of the amplitude.
     loads
         The dead loads, of which moments and potentials are passed over.
+
+    Returns
+    -------
+    energy
+        The energy, linear in u.
+    total_size
+        The sum of the sizes over E h R.
+    size_forms
+        The size of each load as a form, which shows how it depends on the placement.
     """
     integrals = integrals.with_parts(loads)
-    domain = integrals.domain
-    # density and integral of each load, the sum of sizes, and forms of the sizes
-    terms, size, sizes = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form]()
+    terms = list[tuple[Expr, Integral]]()  # density and integral of each load
+    total_size, size_forms = 0.0, list[ufl.Form]()
     for load in forces(loads):
         integral = _integral_of_load(load, integrals)
-        # a pattern: the size is the integral of the density's length
         if not isinstance(load, PointForce) and callable(load.force):
-            direction, known_size = pattern_field(load.force, domain.r0, ADDED_LOAD_DEGREE)
-            terms.append((direction, integral))
-            density_length = ufl.sqrt(ufl.dot(direction, direction))
-            # the pattern's own integral is over all of the surface
-            is_everywhere = isinstance(load, AreaForce) and load.patch is None
-            size += (
-                known_size
-                if known_size is not None and is_everywhere
-                else _integral(density_length, integral, log)
-            )
-            sizes.append(2 * np.pi * integral(density_length))
-            continue
-        # else the size is the density's length times a measure: the length of an end, an area, or 1
-        # of a total force and of a point
-        measure = _circumferential_integral(integral, integrals, log)
-        if isinstance(load, AreaForce) and isinstance(load.force, float):  # a pressure
-            direction = -kin.normal(domain.j0) * domain.constant(load.force)
-            strength = abs(load.force)
+            density, size, size_form = _density_of_pattern(load, integral, integrals, log)
         else:
-            vector = np.asarray(load.force)
-            direction, strength = domain.constant(vector), float(np.linalg.norm(vector))
-        terms.append((direction, integral))
-        size += strength * measure
-        sizes.append(2 * np.pi * integral(domain.constant(strength)))
+            density, size, size_form = _density_of_vector(load, integral, integrals, log)
+        terms.append((density, integral))
+        total_size += size
+        size_forms.append(size_form)
 
     def energy(u: Jet) -> ufl.Form:
         # a sum of forms needs a form to begin with, not 0
-        (first_direction, first_integral), *others = terms
+        (first_density, first_integral), *others = terms
         return sum(
-            (integral(-ufl.dot(direction, u.r)) for direction, integral in others),
-            first_integral(-ufl.dot(first_direction, u.r)),
+            (integral(-ufl.dot(density, u.r)) for density, integral in others),
+            first_integral(-ufl.dot(first_density, u.r)),
         )
 
-    return Energy(name, energy, name, linear=True), size, sizes
+    return Energy(name, energy, name, linear=True), total_size, size_forms
+
+
+def _density_of_pattern(
+    load: EdgeForce | AreaForce, integral: Integral, integrals: RevolutionIntegrals, log: KernelLog
+) -> tuple[Expr, float, ufl.Form]:
+    """Return the density (3,) of a load by formula, its size, and the size as a form.
+
+    The size is the integral of the density's length.
+    """
+    assert callable(load.force)
+    # the pattern as a field, and the integral of its length over all of the surface, if known
+    density, size_everywhere = pattern_field(load.force, integrals.domain.r0, ADDED_LOAD_DEGREE)
+    density_length = ufl.sqrt(ufl.dot(density, density))
+    is_everywhere = isinstance(load, AreaForce) and load.patch is None
+    size = (
+        size_everywhere
+        if size_everywhere is not None and is_everywhere
+        else _integral(density_length, integral, log)
+    )
+    return density, size, 2 * np.pi * integral(density_length)
+
+
+def _density_of_vector(
+    load: PointForce | EdgeForce | AreaForce,
+    integral: Integral,
+    integrals: RevolutionIntegrals,
+    log: KernelLog,
+) -> tuple[Expr, float, ufl.Form]:
+    """Return the density (3,) of a vector or a pressure, its size, and the size as a form.
+
+    The size is the density's length times a measure: the length of an end, an area, or 1 of a total
+    force and of a point.
+    """
+    domain = integrals.domain
+    measure = _circumferential_integral(integral, integrals, log)
+    if isinstance(load, AreaForce) and isinstance(load.force, float):  # a pressure
+        density = -kin.normal(domain.j0) * domain.constant(load.force)
+        density_length = abs(load.force)
+    else:
+        vector = np.asarray(load.force)
+        density, density_length = domain.constant(vector), float(np.linalg.norm(vector))
+    size_form = 2 * np.pi * integral(domain.constant(density_length))
+    return density, density_length * measure, size_form
 
 
 def _integral_of_load(
@@ -199,7 +235,7 @@ def pole_force(
     name
         Name of the amplitude, the force over `unit`.
     force
-        Point and patch of the force.
+        The name of its point, and the radius of its patch over R; 0 for a point.
     unit
         Unit of the force over E h R.
     """
@@ -219,7 +255,7 @@ def pole_force(
 def _circumferential_integral(
     integral: Integral, integrals: RevolutionIntegrals, log: KernelLog
 ) -> float:
-    """Return the integral of 1, all around the axis."""
+    """Return the integral of 1, all around the axis: a length, an area, or 1 of a point."""
     return _integral(integrals.domain.constant(1.0), integral, log)
 
 

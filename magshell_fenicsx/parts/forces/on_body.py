@@ -53,6 +53,8 @@ class BodyMeasures:
         Space of the displacement.
     log
         Compiles forms.
+
+    The field `_thickness` is the thickness over R as a field in the body.
     """
 
     def __init__(self, body: BodyMesh, V: fem.FunctionSpace, log: KernelLog) -> None:
@@ -87,8 +89,8 @@ class BodyMeasures:
         The pattern is taken on the mid-surface under each node. The integral of its size is not
         known, hence None.
         """
-        # nodes of each cell with their normals, their heights over the mid-surface, and the places
-        # of the mid-surface under them
+        # (cells, nodes, 3) places of nodes and normals there; the heights of nodes over the
+        # mid-surface; and the feet, the places of the mid-surface under the nodes
         nodes, normals = body_positions_and_normals(self._V)
         heights = (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
         height = self._body.at_nodes(self._V, heights)[self._V.dofmap.list]
@@ -99,7 +101,9 @@ class BodyMeasures:
         )
         vectors = pattern(feet, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
-        if edge is None:  # over the surface moments are exact; on an edge the values at nodes count
+        # over the surface a formula is projected, so that its moments in each cell are exact; on an
+        # edge its values at nodes are taken
+        if edge is None:
             midsurface_cells = replace(body_cell_geometry(self._V), nodal=feet)
             vectors = project_pattern(
                 pattern, midsurface_cells, vectors, field.function_space.element.basix_element
@@ -117,6 +121,7 @@ class BodyMeasures:
         centre, normal = (fem.Constant(domain, v) for v in (x, n))
         from_point = ufl.SpatialCoordinate(domain) - centre
         height, h = ufl.dot(from_point, normal), thickness_at(self._body, x)
+        # at least as large as the cells at the point reach from its normal line
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
         # 1 in the shell at the point, 0 on the far side of a closed shell
         is_in_shell = ufl.conditional(ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0)

@@ -74,7 +74,9 @@ class DataSection(FileKeys, ImperfectionSection):
         return f"data of {self.file}"
 
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
-        """Return the geometry of the measured imperfection, see `ImperfectionSection`.
+        """Return the geometry of the measured imperfection on the perfect shell.
+
+        The fit of a file is remembered. `key` is the key of the section in the case, for messages.
 
         Raises
         ------
@@ -180,9 +182,9 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     TableError
         If the file cannot be read, or lacks the columns.
     """
-    columns, units = read_table(file, files or Files())
-    # the first kind of places that the file has; without w0 only x, y, z will do, which are then
-    # on the real surface
+    columns, units = read_table(file, files or Files())  # name -> values, and name -> unit
+    # the first of the three kinds of places that the file has; without w0 only x, y, z will do,
+    # which are then on the real surface
     place_columns = None
     for names_of_kind in PLACES:
         is_complete = set(names_of_kind) <= columns.keys()
@@ -196,7 +198,7 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
             "z, w0 of a cylinder"
         )
     names = [*place_columns, *(["w0"] if "w0" in columns else [])]
-    # if lengths have units and w0 has none, it would be over h, which is most likely a mistake
+    # w0 without a unit is over h: beside places with a unit that is most likely a mistake
     lengths_have_units = any(units[name] for name in place_columns if name not in ANGLES)
     if "w0" in units and units["w0"] is None and lengths_have_units:
         raise TableError(
@@ -240,7 +242,7 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
             "neighbours"
         )
     is_finite = np.isfinite(rows).all(axis=1)
-    # fewer do not show the shape of the shell
+    # fewer rows do not show the shape of the shell
     if is_finite.sum() < max(20, len(rows) // 2):
         raise TableError(
             f"has {is_finite.sum()} rows of finite numbers in {len(rows)}; needed are 20, and "
@@ -282,10 +284,11 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
     _refuse_too_deep(w0, h, measured=scan.w0 is not None)
     count = len(w0)
     tree = scipy.spatial.cKDTree(places)
-    # typical distance of neighbours; the first of nine results is the place itself, and its eighth
-    # neighbour is taken to be 1.7 spacings away
-    spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
-    distances = tree.query(surface)[0]  # from places of the surface to the nearest value
+    # typical distance of neighbours: of nine nearest places the first is the place itself, and the
+    # last, its eighth neighbour, is taken to be 1.7 spacings away
+    eighth_distances, _ = tree.query(places, [9])
+    spacing = float(np.median(eighth_distances)) / 1.7
+    distances, _ = tree.query(surface)  # from places of the surface to the nearest value
     if distances.max() > max(MAX_HOLE * sqrt(h), MAX_HOLE_OVER_SPACING * spacing):
         place = place_text(surface[np.argmax(distances)])
         raise TableError(
@@ -360,7 +363,7 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
         assert w0 is not None
         return _places_of_angles(columns, reference.geometry), w0
     x = np.column_stack([columns[name] for name in "xyz"])
-    distance = scipy.spatial.cKDTree(surface).query(x)[0]
+    distance, _ = scipy.spatial.cKDTree(surface).query(x)
     if distance.max() > MAX_DISTANCE_OVER_R:
         row = int(np.argmax(distance))
         raise TableError(
@@ -422,15 +425,23 @@ def _sharpest_bend(function: "ScatteredSpline", x: Array, length: float) -> floa
     """Return 1/k of the shortest wave sin(k x) that a function resembles; infinite for a constant.
 
     A wave a sin(k x) has the range 2 a and the largest second derivative a k², so that 1/k is the
-    root of half the range over this derivative. The derivatives are sums of second differences
-    along the three axes, at places `x` (n, 3). Their step is 0.7 times `length`, which is over R.
+    root of half the range over this derivative. The second derivative is estimated by differences.
+
+    Parameters
+    ----------
+    x
+        (n, 3) places over R at which the function is looked at.
+    length
+        Length over R; the step of the differences is 0.7 times as long.
     """
     x = x[:: max(1, len(x) // 2000)]  # some 2000 places are enough
-    w, d = function(x), 0.7 * length
-    second_differences = (
-        sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
+    w, step = function(x), 0.7 * length
+    # sums of the second differences along the three axes, by size
+    second_derivatives = (
+        sum(np.abs(function(x + step * e) - 2 * w + function(x - step * e)) for e in np.eye(3))
+        / step**2
     )
-    largest = float(np.nanmax(second_differences))
+    largest = float(np.nanmax(second_derivatives))
     return float(np.sqrt(np.ptp(w) / 2 / largest)) if largest > 0 else inf
 
 
@@ -447,11 +458,11 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
     if perfect.sphere:
         r = np.linalg.norm(x, axis=1)
         return x / r[:, None], r - 1
-    # the iteration begins at the nearest places of a sample; each of these is inverted only once
+    # the iteration begins at the charts of the nearest places of a sample; the chart of each of
+    # these is computed only once
     sample = perfect.sample()
-    nearest, row_of_place = np.unique(
-        scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True
-    )
+    _, nearest_of_place = scipy.spatial.cKDTree(sample).query(x)
+    nearest, row_of_place = np.unique(nearest_of_place, return_inverse=True)
     chart = np.array([perfect.inverse(place) for place in sample[nearest]])[row_of_place]
     # the method of Gauss and Newton for the least distance; it converges fast where w0 is small
     # against the radius of curvature
@@ -462,7 +473,7 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
             for e in CHART_STEP * np.eye(2)
         ]
         tangents = np.stack(differences, axis=-1)
-        # the step in the chart: the metric of the surface times it is the residual
+        # the step in the chart solves: metric of the surface times step = residual
         residual = np.einsum("nij,ni->nj", tangents, x - perfect.perfect(chart))
         metric = np.einsum("nij,nik->njk", tangents, tangents)
         step = np.linalg.solve(metric, residual[..., None])[..., 0]
@@ -491,14 +502,10 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     nodes = np.unique(nodes.round(14), axis=0)
     # the nearest nodes (n, NODES_PER_QUADRIC) of each place, and the first one's place and normal
     tree = scipy.spatial.cKDTree(nodes[:, :3])
-    nearest = tree.query(x, NODES_PER_QUADRIC)[1]
+    _, nearest = tree.query(x, NODES_PER_QUADRIC)
     centre, normal = nodes[nearest[:, 0], :3], nodes[nearest[:, 0], 3:]
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
-    # frame (n, 3 vectors, 3 components); the first tangent is normal to the normal, and to the axis
-    # that makes the largest angle with the normal
-    first_tangent = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
-    first_tangent /= np.linalg.norm(first_tangent, axis=1)[:, None]
-    frame = np.stack([first_tangent, np.cross(normal, first_tangent), normal], axis=1)
+    frame = _frames_of_normals(normal)
     # coordinates (n, NODES_PER_QUADRIC) of the neighbours in the frame of each place
     s, t, z = np.moveaxis(
         np.einsum("nkj,nij->nki", nodes[nearest, :3] - centre[:, None], frame), -1, 0
@@ -507,13 +514,24 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     terms = np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)
     quadric = np.linalg.pinv(terms) @ z[..., None]
     a, b, c, d, e, f = quadric[..., 0].T
-    # coordinates of the place itself are p, q and height; slopes of the quadric at (p, q), and the
-    # vertical distance from there to the place
+    # the place itself has the coordinates s = p, t = q, z = height. There the quadric has two
+    # slopes; the gap is the distance from the quadric to the place along z
     p, q, height = np.einsum("nj,nij->ni", x - centre, frame).T
     slope_s, slope_t = b + 2 * d * p + e * q, c + e * p + 2 * f * q
     gap = height - (a + b * p + c * q + d * p * p + e * p * q + f * q * q)
-    # unit normal of the quadric in the frame; the distance along it is the part of the gap
+    # unit normal of the quadric in the frame; w0 is the component of the gap along it
     upwards = np.stack([-slope_s, -slope_t, 0 * p + 1], axis=-1)
     upwards /= np.linalg.norm(upwards, axis=1)[:, None]
     w0 = gap * upwards[:, 2]
     return x - w0[:, None] * np.einsum("ni,nij->nj", upwards, frame), w0
+
+
+def _frames_of_normals(normal: Array) -> Array:
+    """Return frames (n, 3 vectors, 3 components): two tangents, and the unit normals (n, 3).
+
+    The first tangent is normal to the normal, and to the axis that makes the largest angle with the
+    normal.
+    """
+    first_tangent = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
+    first_tangent /= np.linalg.norm(first_tangent, axis=1)[:, None]
+    return np.stack([first_tangent, np.cross(normal, first_tangent), normal], axis=1)

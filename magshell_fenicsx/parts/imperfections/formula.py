@@ -39,7 +39,7 @@ class FormulaSection(ImperfectionSection):
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
-        """Return the geometry of the formula, see `ImperfectionSection`.
+        """Return the geometry of the formula on the perfect shell.
 
         The element size is 2.5/k of the shortest wave a sin(k x) that the formula resembles: a is
         half its range, a k² its largest second derivative. It varies from place to place if only a
@@ -69,7 +69,7 @@ class FormulaSection(ImperfectionSection):
 
             From the range 2 a and the curvature a k^2 follows 1/k, the root of half their quotient.
             """
-            taylor = formula_derivatives(places)
+            taylor = formula_derivatives(places)  # values and derivatives of the formula
             curvature = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
             depth = max(range_of_formula, float(np.ptp(np.nan_to_num(taylor.value))))
             # the least divisor makes the size huge, not infinite, where the formula is flat
@@ -82,7 +82,7 @@ class FormulaSection(ImperfectionSection):
         size = np.inf
         if range_of_formula > 0 and at_sample.min() < MAX_ELEMENT_SIZE:
             size = float(at_sample.min())
-        # sizes differ from place to place if few places need about the least size
+        # the size varies from place to place if few places need about the least size
         is_local = not (at_sample < 2 * size).mean() > MAX_LOCAL_SHARE
         return ImperfectionGeometry(deviation, size, sizes=sizes if is_local else None)
 

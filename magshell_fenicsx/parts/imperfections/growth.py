@@ -68,7 +68,7 @@ class ImperfectionStep(LoadStep):
             With the key and what is allowed.
         """
         imperfections: Mapping[str, object] = context.sections["imperfections"]
-        load_of_amplitude = context.loads(ImperfectionStep)
+        load_of_amplitude = context.loads(ImperfectionStep)  # amplitude -> section of its step
         context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
         if not imperfections:
             raise ValueError(
@@ -115,7 +115,8 @@ def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str,
     items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
 
     def grows(key: str, item: int | None) -> bool:
-        # the dots distinguish items 1 and 10; random dimples have longer keys
+        # the dot at the end distinguishes items 1 and 10. The key of a random dimple goes on after
+        # the number of its item: "imperfections.0.dimples.3"
         return item is None or f"{key}.".startswith(f"imperfections.{item}.")
 
     return {name: [key for key in keys if grows(key, item)] for name, item in items.items()}

@@ -142,8 +142,8 @@ def half_width(width: float, R_over_h: float, nu: float) -> float:
 def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
     """Return a pydantic validator that keeps a number, or makes one of a length with a unit.
 
-    The result is over h, or in the unit of a dimple's width, see `half_width`. The sizes are in the
-    context of the validation, see `note_sizes`.
+    The result is over h, or in the unit of a dimple's width, (h R)^(1/2)/(12 (1 - nu^2))^(1/4). The
+    sizes of both in metres are in the context of the validation, where `note_sizes` puts them.
     """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
@@ -151,8 +151,10 @@ def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
         if not isinstance(value, str):
             return value
         metres = in_units("metre")(value)
+        # no sizes are noted if the shell itself is wrong, which has a message of its own: then any
+        # number will do
         if info.context and CONTEXT not in info.context:
-            return 1.0  # the shell is wrong: any number will do
+            return 1.0
         sizes = (info.context or {}).get(CONTEXT)
         if not sizes:
             raise ValueError(
@@ -167,11 +169,13 @@ def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
 def note_sizes(
     data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool
 ) -> None:
-    """Note in the context of a validation by which sizes lengths of imperfections are divided.
+    """Note in the context of a validation the sizes of the shell by which lengths are divided.
 
-    They are sizes in metres of the shell without its imperfections, and none without units. Nothing
-    is noted for a wrong shell: its own message says what is wrong. Nothing is noted either if no
-    imperfection has a length as text: then the shell need not be validated twice.
+    Lengths of imperfections that have a unit become numbers over h, or over a dimple's unit of
+    width. For that the shell is validated first without its imperfections. Its two sizes in metres
+    are noted; without units of lengths an empty mapping. Nothing is noted for a wrong shell, whose
+    own message says what is wrong. Nothing is noted either if no imperfection has a length as text:
+    then the shell need not be validated twice.
 
     Parameters
     ----------
@@ -186,7 +190,7 @@ def note_sizes(
         return
     if not any(map(_has_text, _imperfections(data))):
         return
-    info.context.pop(CONTEXT, None)  # of an earlier shell of the case
+    info.context.pop(CONTEXT, None)  # sizes of an earlier shell of the case
     try:
         shell: Sized = handler({key: value for key, value in data.items() if key not in KEYS})
     except ValidationError:
@@ -303,7 +307,8 @@ class LocalSection(ImperfectionSection):
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
         depth = abs(self.amplitude) / R_over_h
-        _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
+        steepest_slope = self.deviation.steepest * depth / self.half_width(R_over_h, nu)
+        _refuse_steep(depth, steepest_slope)
 
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the profile around the section's place on the perfect shell.
@@ -314,6 +319,7 @@ class LocalSection(ImperfectionSection):
             If the place is not on the surface.
         """
         profile_class, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
+        # place (3,) of the centre, and the function from places to distances from it
         place, distance = locate(self.at, reference, key)
         # elements resolve the shell's own bending length, and a profile that is narrower
         size = min(

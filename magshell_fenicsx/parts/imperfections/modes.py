@@ -115,10 +115,10 @@ class ModesSection(FileKeys, ImperfectionSection):
         """
 
         def part_of(mode: Mode) -> Shape | None:
-            """Return the mode on this shell; None if it does not move it."""
+            """Return the part of a mode on this shell; None if the mode does not move it."""
             if not isinstance(mode, OfShells):
                 return mode
-            # on one of several shells, in the frame of this shell
+            # of several shells: the part on this one, in its own frame
             return PlacedMode(mode.parts[name], place) if place and name in mode.parts else None
 
         parts = [part_of(mode) for mode in modes[: len(self.amplitudes)]]
@@ -147,9 +147,12 @@ class ModesSection(FileKeys, ImperfectionSection):
             self.become((mode,))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
-        # words such as "0.1 h of mode 1 (m = 3)"; a wave around e3 has its number as m
-        waves = [getattr(shape, "m", None) for shape in shapes]
-        names = [f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(waves, 1)]
+        # words such as "0.1 h of mode 1 (m = 3)"; m is the number of waves around e3, of a mode
+        # that has it
+        wave_numbers = [getattr(shape, "m", None) for shape in shapes]
+        names = [
+            f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(wave_numbers, 1)
+        ]
         words = [
             f"{a:g} h of {self.file or name}"
             for a, name in zip(self.amplitudes, names, strict=False)
@@ -324,7 +327,8 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
         np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0
     ):
         raise CaseError(f"{key}: the mode has no finite displacement")
-    if scipy.spatial.cKDTree(r0).query(sample)[0].max() > MAX_DISTANCE_OVER_R:
+    distance_to_node, _ = scipy.spatial.cKDTree(r0).query(sample)
+    if distance_to_node.max() > MAX_DISTANCE_OVER_R:
         raise CaseError(
             f"{key}: is the mode of another shell: it does not reach all places of this one"
         )
@@ -332,10 +336,10 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
 
 
 def over_largest(places: Array, w: Array) -> Array:
-    """Return values (n,) over the largest of them, with its sign.
+    """Return values (n,) over the largest of them in size, with its sign, so that it becomes 1.
 
     Of several equally large values, the one at the highest of the places (n, 3) gives the sign.
-    The order of the values does not matter.
+    The result does not depend on the order of the values.
     """
     magnitude = np.abs(w)
     largest_rows = np.flatnonzero(magnitude > (1 - CREST_TOLERANCE) * magnitude.max())

@@ -87,7 +87,7 @@ class RandomSection(ImperfectionSection):
                 section_class.model_validate(item, context=dict(self._sizes)) for item in items
             ]
         except ValidationError as e:
-            error = e.errors()[0]  # of the first: all are alike
+            error = e.errors()[0]  # of the first dimple: those of the others are alike
             raise ValueError(
                 f"dimples: {error['loc'][-1]}: {error['msg'].removeprefix('Value error, ')}"
             ) from None
@@ -139,6 +139,7 @@ class RandomWaves:
         # in parts, since the array of places times waves would be large
         for i in range(0, len(places), PLACES_AT_ONCE):
             x = places[i : i + PLACES_AT_ONCE]
+            # phase_j + k_j . x/length of each place and wave
             angles = self._waves[3] + sum(x[:, j : j + 1] * self._waves[j] for j in range(3))
             w0[i : i + PLACES_AT_ONCE] = np.cos(angles).sum(axis=1)
         return self.delta * sqrt(2 / WAVE_COUNT) * w0

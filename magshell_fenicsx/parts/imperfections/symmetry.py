@@ -103,7 +103,7 @@ class _Sum:
         None also for a mixture of angular and straight distances. There may be thousands of
         deviations.
         """
-        # centres: unit vectors of angular distances, or else places of straight distances
+        # centres: unit vectors if distances are angles, else places
         local_deviations = [d for d in self.deviations if isinstance(d, Local)]
         axes = [
             d.distance.axis for d in local_deviations if isinstance(d.distance, AngularDistance)
@@ -114,7 +114,8 @@ class _Sum:
         # fewer centres than deviations: some are not local, or their distances are of both kinds
         if not centres or len(centres) < len(self.deviations):
             return None
-        # a row of each deviation: centre, width and number of the profile; a class has one profile
+        # a row of each deviation: centre, width and number of the profile. Each subclass of `Local`
+        # has one profile; its number is that of the class
         classes = list(dict.fromkeys(type(d) for d in local_deviations))
         shapes = [(d.width, classes.index(type(d))) for d in local_deviations]
         rows = np.round(np.column_stack([centres, shapes]) / IMAGE_TOLERANCE) * IMAGE_TOLERANCE
@@ -133,7 +134,7 @@ class _Sum:
         None means that the deviations must be compared by their values at many places.
         """
         numbers = self.numbers
-        # the image of a unit vector is one only under a plane through the origin
+        # only a plane through the origin maps unit vectors to unit vectors
         if numbers is None or (numbers.angles and mirror.offset):
             return None
         # the deviation that lies nearest to the mirror image of each one
@@ -146,11 +147,12 @@ class _Sum:
         if not has_no_image.any():
             # not decided if two deviations have the same image
             return True if len(np.unique(nearest)) == len(nearest) else None
-        # several deviations together may make up for a missing image. The values at some centres
-        # without one show that they do not; if they do not show it, nothing is decided.
+        # several deviations together may still make the image of one. Where the sum w0 differs
+        # between the centre of one without an image and its mirror image, they do not; else nothing
+        # is decided
         centres = rows[np.flatnonzero(has_no_image)[:FIRST_COMPARED], :3]
-        differs = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
-        return False if differs > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
+        difference = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
+        return False if difference > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
 
 
 def imperfection_constraints(
@@ -177,10 +179,12 @@ def imperfection_constraints(
     def mirrors(mirror: Mirror) -> bool:
         """Return whether a plane is a plane of symmetry of all groups of imperfections.
 
-        Groups that their numbers do not decide are compared by values at the sample.
+        A comparison of centres, widths and depths decides most groups. The others are compared by
+        values w0 at the sample.
         """
         undecided = []
         for group in groups:
+            # False: it is none; None: not decided
             if (answer := group.mirrored(mirror)) is False:
                 return False
             if answer is None:
@@ -197,10 +201,12 @@ def imperfection_constraints(
         reason = "an imperfection is off the axis"
     elif perfect.meridian and _differ_around_e3(groups, perfect.meridian.interior_sample()):
         reason = "an imperfection differs around e3"
-    # a shell that is not round has its own candidates for planes
+    # of a shell that is not round, such as a plate, the shell itself says which planes may be
+    # planes of symmetry: no vectors or azimuths are given
     if not perfect.round:
         return [SymmetryConstraint(reason, (), mirrors)]
-    # those of a round shell go through all centres, or between centres of different azimuths
+    # of a round shell they are planes through e3: that through all centres, if there is one, else
+    # those between centres of different azimuths
     if common_azimuth(centres_off_axis) is None:
         azimuths = _azimuths_of_planes(centres_off_axis)
         return [SymmetryConstraint(reason, (), mirrors, azimuths=azimuths)]
@@ -230,10 +236,8 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
     ]
     # the plane at the mean of two azimuths maps one place to the other; with the first place in
     # both roles it contains that place
-    return tuple(
-        (atan2(x[1], x[0]) + atan2(first_place[1], first_place[0])) / 2
-        for x in (first_place, *at_same_distance)
-    )
+    azimuth = atan2(first_place[1], first_place[0])
+    return tuple((atan2(x[1], x[0]) + azimuth) / 2 for x in (first_place, *at_same_distance))
 
 
 def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline) -> Array:
@@ -260,7 +264,7 @@ def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline)
 
 
 def _are_equal(w0: Array, image: Array) -> bool:
-    """Return whether deviations and those at the images of their places are equal but rounding."""
+    """Return whether deviations w0 are equal to those at the image places, up to rounding."""
     largest = max(np.abs(w0).max(), np.abs(image).max())
     return bool((np.abs(w0 - image) <= EQUALITY_TOLERANCE * largest).all())
 
@@ -272,9 +276,9 @@ class LocalImperfection:
     Attributes
     ----------
     centre, radius
-        The disc that needs small elements.
+        The disc in the chart that needs small elements.
     size
-        Element size over R, see `ImperfectionGeometry`.
+        The largest element size over R that resolves it.
     circle
         Whether its outline is a circle around the chart's origin.
     jumps
@@ -326,7 +330,7 @@ def local_imperfections(
     for key, imperfection in imperfections:
         if imperfection.centre is None:
             continue
-        # at the pole of a disc: a circle about the origin of the chart, needing no contour
+        # at the pole of a disc its outline is a circle about the origin of the chart
         if perfect.disc and np.hypot(*imperfection.centre[:2]) < AXIS_TOLERANCE:
             local_imperfections.append(
                 LocalImperfection(
@@ -407,7 +411,8 @@ def contour(
         chart = centre + t[..., None] * rays
         return distance(perfect.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
-    # equal intervals of each ray, and whether each (interval, ray) ends at the distance or beyond
+    # the ends of equal intervals of each ray, and flags (intervals, rays) whether an interval ends
+    # at the wanted distance or beyond
     ray_lengths = np.linspace(0, MAX_CHART_STRETCH * reach, CONTOUR_STEPS + 1)[1:]
     is_outside = distance_beyond(np.tile(ray_lengths[:, None], CONTOUR_CORNERS)) >= 0
     if not is_outside.any(axis=0).all():
@@ -436,7 +441,8 @@ def _root_by_false_position(f: Callable[[Array], Array], low: Array, high: Array
     for _ in range(FALSE_POSITION_ROUNDS):
         secant_zero = high - f_high * (high - low) / (f_high - f_low)
         f_zero = f(secant_zero)
-        # the other end: `high` if the zero of f lies between it and that of the secant, else `low`
+        # the secant's zero becomes one end, called `high`. The other end, called `low`, is the old
+        # `high` if f changes its sign between them; else the old `low` stays with half its value
         is_crossed = f_zero * f_high < 0
         low, f_low = np.where(is_crossed, high, low), np.where(is_crossed, f_high, f_low / 2)
         # where the zero is hit, a tiny value keeps the quotient from 0/0

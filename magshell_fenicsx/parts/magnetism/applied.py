@@ -115,6 +115,11 @@ class AppliedField:
         B, G and H of the field at rest, at the present places.
     _fields_at_places
         The moving fields at the places where they were last evaluated.
+    _r0, _displacement
+        Undeformed places and displacements (cells, points, 3) at quadrature points; memos, whose
+        `renew` returns the present value.
+    _field_at_rest, _moving_fields, _u, _degree
+        The parameters.
     """
 
     def __init__(
@@ -166,10 +171,12 @@ class AppliedField:
         field is not finite. Later states do not clear it.
         """
         displacement, places = self._displacement.renew(), self.places
+        # field with first and second derivatives at the present places (n, 3)
         B, G, H = self._total_field(self._values_at_rest.renew(), places)
         is_lost = ~np.isfinite(B).all(axis=1)
         self.lost = self._lost_description(places[is_lost][0]) if is_lost.any() else self.lost
-        # second order: B,jk dx_j dx_k/2 over pairs j <= k, where j < k stands for two equal terms
+        # coefficients of second order: B,jk dx_j dx_k/2 for pairs j <= k. Of j < k there are two
+        # equal terms, which cancel the half
         second_order = H[:, :, *COMPONENT_PAIRS] * np.where(
             COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0
         )
@@ -182,8 +189,8 @@ class AppliedField:
     def slope(self, name: str, other: str = "", *, at_present_places: bool = True) -> PointField:
         """Return a point field of the derivative of the Taylor polynomial by one or two amplitudes.
 
-        With `name` alone it has dB/dmu and its gradient; with `other` too, d2B/dmu_i dmu_j without
-        a gradient. The values follow the state.
+        With `name` alone it has dB/dmu and its gradient. With `other` too it has the second
+        derivative d2B/dmu_i dmu_j, without a gradient. The values follow the state.
 
         Parameters
         ----------
@@ -241,7 +248,7 @@ class AppliedField:
         for moving_field in [*parts_at_rest, *self._moving_fields]:
             field = moving_field.at_rest
             if distance := getattr(field, "distance", None):
-                # the places as seen from the body, which moves by x -> Q x + t
+                # the places of both states as seen from the body, which moves by x -> Q x + t
                 seen_from_body = []
                 for x, mu in (start, end):
                     Q, t = combined_motion(moving_field.motions, mu)
@@ -266,7 +273,8 @@ class AppliedField:
 
     def _lost_description(self, x: Array) -> str:
         """Describe for the user why the field is not finite at a place (3,); "" if it is finite."""
-        # a sum of fields is looked at summand by summand, so that the right one is named
+        # pairs of a field and its value: a sum of fields is looked at summand by summand, so that
+        # the right one is named
         values_at_rest = [
             (field_part, field_part(x[None])[0])
             for field_part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
@@ -326,6 +334,7 @@ class FieldAmplitude:
         For an energy that is linear in the field, dB/dmu replaces the field in the form. A
         quadratic energy is differentiated along the change of the Taylor polynomial.
         """
+        # `slope` returns dB/dmu as a field at quadrature points
         linear = [self._with_polynomial(t, self.applied.slope(self.name)) for t in self._linear]
         quadratic = [
             self._derivative_along(t, self.applied.slope(self.name, at_present_places=False))
@@ -343,14 +352,16 @@ class FieldAmplitude:
             if hasattr(q, "second_derivatives"):  # q knows the mixed derivative
                 derivatives: Sequence[Derivative] = q.second_derivatives(self)
                 return derivatives
+            # a UFL constant: dPi/dmu is differentiated by it
             terms_with_q = [t for t in self.slopes() if q in t.form.constants()]
             return [self._term(t, derived(t.form, q)) for t in terms_with_q]
         if q.applied is not self.applied:
             return []
+        # energies that are linear in the field: d2B/dmu dq in its place
         linear = [
             self._with_polynomial(t, self.applied.slope(self.name, q.name)) for t in self._linear
         ]
-        # quadratic energies: Pi' along d2B/dmu dq, and Pi'' along dB/dmu and dB/dq
+        # quadratic energies: the sum of Pi' along d2B/dmu dq, and of Pi'' along dB/dmu and dB/dq
         by_both_change, by_first, by_second = (
             self.applied.slope(*names, at_present_places=False)
             for names in ((self.name, q.name), (self.name,), (q.name,))

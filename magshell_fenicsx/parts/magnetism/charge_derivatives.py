@@ -53,7 +53,7 @@ def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex
         (n, k, 3) nodes of their cells, with rates as imaginary parts.
     """
     T = np.moveaxis(points.tables, -2, 0)  # shape functions, and their two derivatives
-    r, a1, a2 = _interpolated(T, nodes)
+    r, a1, a2 = _interpolated(T, nodes)  # places, and both tangents
     area_vector = np.cross(a1, a2)
     n = area_vector / np.sqrt(np.sum(area_vector * area_vector, axis=-1, keepdims=True))
     heights = points.t[rows][..., None] * points.heights
@@ -101,9 +101,9 @@ def pair_derivatives(
     left, right
         Points on each pair's first and second cell, and their rows (n,).
     """
-    by_left, by_right = (np.zeros_like(points.q) for points, _ in (left, right))
-    left_points, right_points = left[0], right[0]
-    # either all pairs of points count, or each left point has right points of its own
+    (left_points, _), (right_points, _) = left, right
+    by_left, by_right = np.zeros_like(left_points.q), np.zeros_like(right_points.q)
+    # all left points share the right points, or each left point has right points of its own
     is_shared = right_points.tables.ndim == 3
     right_charges = right_points.q[0].size if is_shared else right_points.q[0, 0].size
     charge_pairs = left_points.q[0].size * right_charges  # of one pair of elements
@@ -112,15 +112,17 @@ def pair_derivatives(
     derivatives = _by_heights if heights else _by_charges
     for first in range(0, len(cells), batch_size):
         batch = slice(first, first + batch_size)
-        # components of places and normals of the left and the right charges
+        # components of places and normals of the left charges (x) and of the right ones (y)
         x, y = (
             _components(points, rows[batch], nodes[cells[batch, side]], is_shared)
             for side, (points, rows) in enumerate((left, right))
         )
-        # charges in the shape of a component of places
+        # left and right charges, in the shape of a component of their places
+        (first_of_x, *_), _ = x
+        (first_of_y, *_), _ = y
         q, p = (
-            points.q[rows[batch]].reshape(*places_and_normals[0][0].shape)
-            for (points, rows), places_and_normals in ((left, x), (right, y))
+            points.q[rows[batch]].reshape(*first_component.shape)
+            for (points, rows), first_component in ((left, first_of_x), (right, first_of_y))
         )
         # the derivatives of the batch are added to the rows of its elements, on both sides
         for total, (_, rows), derivative in zip(

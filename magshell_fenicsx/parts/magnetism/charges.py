@@ -81,8 +81,9 @@ def _extent_points(dimension: int) -> Array:
 
 EXTENT_POINTS = {dimension: _extent_points(dimension) for dimension in (2, 3)}
 
-# height over the thickness, and the three factors of the remanence and its derivatives by a and b:
-# a charge is the sum of their scalar products
+# of charges: their height over the thickness, and three vectors (n, m, 3), the factors of the
+# remanence and of its derivatives by a and b. A charge is the sum of three scalar products, of each
+# factor with the remanence, or with its derivative
 Layer = tuple[Any, tuple[Array, Array, Array]]
 
 
@@ -224,15 +225,18 @@ class ChargedElements:
         TooNear
             If a place is in the shell's surface, after all others have their boxes.
         """
-        # a little inside, as a cell may have no normal at a corner
-        corners = np.clip(EXTENT_POINTS[self.dimension], BOUNDARY_INSET, 1 - BOUNDARY_INSET)
+        # points that show the extent of a box; a little inside, as a cell may have no normal at a
+        # corner
+        extent_points = np.clip(EXTENT_POINTS[self.dimension], BOUNDARY_INSET, 1 - BOUNDARY_INSET)
+        # at first each element is a box, and each place is paired with all of them
         boxes = Boxes.undivided(self.count, self.dimension)
         place_of_pair = np.repeat(np.arange(len(places)), self.count)
         box_of_pair = np.tile(np.arange(self.count), len(places))
         for _ in range(MAX_HALVINGS):
             if not len(box_of_pair):
                 return
-            box_places = self.box_places(boxes, corners)
+            # (boxes, points, k, 3), with k places through the thickness; the first is the middle
+            box_places = self.box_places(boxes, extent_points)
             centre = box_places[:, 0]
             radius = np.sqrt(((box_places - box_places[:, :1]) ** 2).sum(axis=-1)).max(axis=(1, 2))
             # there are several centres through the thickness, of which the nearest counts
@@ -279,6 +283,8 @@ class ShellFaces(ChargedElements):
         Number of sectors of a swept cell; 1 for a triangle.
     _inside
         Pairs of the height and the weight of each layer inside; empty if there are none.
+    shape
+        The magnetised shell.
     """
 
     def __init__(
@@ -291,7 +297,8 @@ class ShellFaces(ChargedElements):
         self._sector = np.tile(np.arange(sectors), len(cells))
         self._sectors, self.count = sectors, sectors * len(cells)
         spread = np.abs(shape.remanence - shape.remanence[:, :1]).max(initial=0.0)
-        # a uniform remanence has no charge inside; around an axis only an axial one is uniform
+        # a uniform remanence has no charge inside; one that is swept around the axis is uniform in
+        # space only if it is along the axis
         is_uniform = spread <= 1e-12 * np.abs(shape.remanence).max(initial=0.0)
         is_axial = not shape.swept or not np.abs(shape.remanence[..., :2]).any()
         is_uncharged = is_uniform and is_axial
@@ -334,7 +341,10 @@ class ShellFaces(ChargedElements):
         # pairs of a place and a box near it, with the number of the nearest grid point of the box
         place, box, point = self._nearest_grid_points(places, self._jets(boxes, start))
         if len(place):
-            has_foot = self._feet_within(boxes[box], start[point][:, None], places[place][:, None])
+            # whether the place of each pair is above or below a point of the box, in the shell
+            has_foot = self._feet_within(
+                boxes[box], ab=start[point][:, None], x=places[place][:, None]
+            )
             is_inside[place[has_foot]] = True
         return is_inside
 
@@ -355,6 +365,8 @@ class ShellFaces(ChargedElements):
         """
         from scipy.spatial import cKDTree  # takes long to import
 
+        # (boxes,) distance from a box's grid points within which places in the shell lie; then for
+        # each place the numbers of all grid points within the largest of these distances
         reach = _reach_of_grid(grid)
         candidates = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
         place = np.repeat(np.arange(len(places)), [len(array) for array in candidates])
@@ -379,9 +391,9 @@ class ShellFaces(ChargedElements):
         for _ in range(NEWTON_STEPS):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
-            # the change of (a, b) along which the tangent plane comes nearest to the place
+            # the change of (a, b) to the point of the tangent plane that is nearest to the place
             step = np.einsum("nmdi,nmi->nmd", np.linalg.pinv(J), x - foot.r[0])
-            # the Jacobian is by b of the whole ring, of which an element is one sector
+            # J has the derivative by b of the whole ring, while b counts within one sector here
             step[..., 1] *= self._sectors
             ab = np.clip(ab + step, BOUNDARY_INSET**3, 1 - BOUNDARY_INSET**3)
         foot = self._jets_at(boxes, ab)
@@ -417,6 +429,7 @@ class ShellFaces(ChargedElements):
             """
             layers_of_jets = list[Layer]()
             for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):  # outward normals are opposite
+                # derivatives of the undeformed place by a and b
                 G1, G2, _ = at.layer(eta)
                 layers_of_jets.append(
                     (eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1))
@@ -505,6 +518,7 @@ class EdgeStrips(ChargedElements):
         The outward area vector is the cross product of the undeformed edge's tangent and dX/deta.
         """
         jets, tangents, eta = self._jets(boxes, x)
+        # (n, m) share of each point in the area of its box; an element is one sector of the ring
         area = (
             np.prod(boxes.size, axis=1)[:, None]
             * weights
@@ -513,6 +527,7 @@ class EdgeStrips(ChargedElements):
 
         def layers(jets: SurfaceJets) -> list[Layer]:
             """Return the points of the strip as a single layer, each with its own height."""
+            # derivatives of the undeformed place by a, b and the height
             G1, G2, G3 = jets.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
             tangent = tangents[:, None, :1] * G1 + tangents[:, None, 1:] * G2
             outward = area[..., None] * np.cross(tangent, G3)
@@ -567,20 +582,10 @@ def _point_charges(
     """
     n, layers = unit(np.cross(jets.r[1], jets.r[2])), layers_of(jets)
     thickness = jets.thickness[..., None]
+    # places (n, m, layers, 3): the mid-surface, plus the height along the normal
     x = np.stack([jets.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
 
-    def charges(layers: list[Layer]) -> Array:
-        """Return the charges (n, m, layers): factors of layers times B and its derivatives.
-
-        B does not depend on the shape, the factors do.
-        """
-        charges_of_layers = [
-            sum(np.sum(c * b, axis=-1) for c, b in zip(factors, jets.B, strict=True))
-            for _, factors in layers
-        ]
-        return np.stack(charges_of_layers, axis=2)
-
-    q = charges(layers)
+    q = _charges_of_layers(layers, jets.B)
     if nodal_derivatives is None:
         return PointCharges(x, q)
 
@@ -596,14 +601,31 @@ def _point_charges(
             for j in range(3)
         ]
         jets.add_derivatives(
-            nodal_derivatives, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B)
+            nodal_derivatives,
+            by_place=on_x.sum(axis=2),
+            by_normal=(heights * on_x).sum(axis=2),
+            by_B=np.stack(by_B),
         )
-        # the charges' factors depend on the undeformed shell, too
+        # the charges' factors depend on the undeformed shell, too; B does not
         jets.add_reference_derivatives(
-            nodal_derivatives, lambda other: charges(layers_of(other)), on_q
+            nodal_derivatives,
+            charges_of=lambda other: _charges_of_layers(layers_of(other), jets.B),
+            by_charges=on_q,
         )
 
     return PointCharges(x, q, add_derivatives)
+
+
+def _charges_of_layers(layers: list[Layer], B: Array) -> Array:
+    """Return the charges (n, m, layers): factors of layers times B and its derivatives.
+
+    B (3, n, m, 3) are the remanence and its derivatives by a and b.
+    """
+    charges_of_layers = [
+        sum(np.sum(factor * b, axis=-1) for factor, b in zip(factors, B, strict=True))
+        for _, factors in layers
+    ]
+    return np.stack(charges_of_layers, axis=2)
 
 
 def field(families: Sequence[ChargedElements], places: Array) -> Array:
@@ -707,8 +729,9 @@ def gradient(
         value += float(np.sum(charges.q * kernel))
         # 4 pi times the derivative of the kernel by the place; by a charge's place it is opposite
         kernel_slope = e / r[..., None] ** 3 - 3 * (d @ e / r**5)[..., None] * d
+        by_charge_places = -charges.q[..., None] * kernel_slope / (4 * np.pi)
         assert charges.add_derivatives
-        charges.add_derivatives(-charges.q[..., None] * kernel_slope / (4 * np.pi), kernel)
+        charges.add_derivatives(by_charge_places, kernel)
     return value
 
 
@@ -764,7 +787,7 @@ def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
     two triangles. They share the quadrangle's charge by area; triangles almost without area are
     left out.
     """
-    # parts x parts boxes of each element
+    # parts x parts boxes of each element, by their lowest corners
     low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(
         -1, 2
     )
@@ -787,6 +810,7 @@ def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
         area = np.linalg.norm(
             np.cross(halves[:, :, 1] - halves[:, :, 0], halves[:, :, 2] - halves[:, :, 0]), axis=-1
         )
+        # each of both triangles has a share of its quadrangle's charge
         share = area / area.sum(axis=1, keepdims=True)
         has_area = (share > MIN_AREA_SHARE).ravel()
         triangles_and_charges.append(

@@ -113,6 +113,7 @@ class MagnetisedSolid:
         # reference coordinates (n, 3) of the places, each in its cell
         reference = self.element.points[nearest]
         for _ in range(NEWTON_STEPS):
+            # deformed places there, and their three derivatives by reference coordinates
             value, *gradients = np.einsum(
                 "dnk,nki->dni", tables(self.element, reference[:, None], 1)[:, :, 0], nodes
             )
@@ -135,6 +136,8 @@ class SolidCharges(ChargedElements):
         The solid with all its cells.
     cells
         (count,) the number of each element's cell; a cell may occur once for each face.
+
+    The field `_nodes` (cells, nodes, 3) has the deformed nodes of all cells.
     """
 
     def __init__(self, shape: MagnetisedSolid, cells: Ints) -> None:
@@ -198,7 +201,7 @@ class SolidCharges(ChargedElements):
         remanence_tables = tables(solid.remanence_element, reference, 1)
         slopes_of_X = np.einsum("dnmk,nki->dnmi", shape_tables[1:], solid.X[cells])
         remanence = np.einsum("dnmk,nki->dnmi", remanence_tables, solid.remanence[cells])
-        # a charge is the sum of factors times the remanence and its derivatives
+        # a charge is the sum of factors (4, n, m, 3) times the remanence and its derivatives
         weights_in_boxes = np.prod(boxes.size, axis=1)[:, None] * weights
         factors = self.remanence_factors(boxes, slopes_of_X, weights_in_boxes)
         place = np.einsum("nmk,nki->nmi", shape_tables[0], self._nodes[cells])
@@ -227,7 +230,10 @@ class SolidCharges(ChargedElements):
 
 
 class CellFaces(SolidCharges):
-    """Charges Br . N dA0 of cells' faces with outward normals N; `faces` are local numbers."""
+    """Charges Br . N dA0 of cells' faces with outward normals N.
+
+    The field `_faces` (count,) is the local number of each element's face in its cell.
+    """
 
     def __init__(self, shape: MagnetisedSolid, cells: Ints, faces: Ints) -> None:
         super().__init__(shape, cells)
@@ -237,8 +243,13 @@ class CellFaces(SolidCharges):
         return places_on_faces(self._faces[boxes.elements], boxes.points(x))
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """Return outward area vectors times weights as factors of Br, zero for its derivatives."""
+        """Return the factors (4, n, m, 3) of Br, and of its derivatives, in the charges.
+
+        That of Br is the outward area vector times the weight; those of its derivatives are zero.
+        Arguments are those of the base class: X are derivatives of undeformed places.
+        """
         faces, factors = self._faces[boxes.elements], np.zeros((4, *X.shape[1:]))
+        # derivatives of undeformed places along both coordinates of the face
         tangent_a, tangent_b = (
             np.einsum("nd,dnmi->nmi", FACE_TANGENTS[faces, side], X) for side in range(2)
         )
@@ -257,9 +268,11 @@ class CellInteriors(SolidCharges):
         return boxes.points(x)
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """Return factors of Br's derivatives for -Div Br dV0: minus cofactors times weights.
+        """Return the factors (4, n, m, 3) of Br, which is zero, and of its derivatives.
 
-        The volume element cancels the determinant in the inverse of dX/d(a, b, c).
+        -Div Br dV0 has minus the cofactors of dX/d(a, b, c) times weights: the volume element
+        cancels the determinant in the inverse of this matrix. Arguments are those of the base
+        class: X are derivatives of undeformed places.
         """
         factors, density = np.zeros((4, *X.shape[1:])), -weights[..., None]
         for d in range(3):

@@ -65,6 +65,7 @@ class StoredBlocks:
             diagonal.
         """
         numbers = np.flatnonzero(is_selected).astype(np.int32)
+        # how many blocks are selected before each block; then before each row
         counts = np.append(0, np.cumsum(is_selected, dtype=np.int32))
         starts = counts[stiffness.starts].astype(np.int32)
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
@@ -81,6 +82,7 @@ class BlockRotation:
     """The rotation of second derivatives with their nodes; the constructor is collective."""
 
     def __init__(self, comm: MPI.Comm) -> None:
+        """Compile the loop; on a single rank (`_upper`) half of the symmetric matrix is stored."""
         source = Path(__file__).with_name("corotated_stiffness.c")
         self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
         self._upper = comm.size == 1
@@ -110,8 +112,8 @@ class BlockRotation:
         stored
             The blocks to rotate.
         """
-        count = len(stiffness.columns)
-        if len(stiffness.turn) > 2:
+        count = len(stiffness.columns)  # of modelled blocks, before those of images
+        if len(stiffness.turn) > 2:  # the modelled part and more than one image
             return None
         pointer = self._pointer
         values = np.empty((len(stored.columns), 3, 3), dtype=np.float32)

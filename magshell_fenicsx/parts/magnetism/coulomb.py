@@ -31,7 +31,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights, pair_derivatives
+from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, pair_derivatives
 from magshell_fenicsx.parts.magnetism.charges import Boxes, EdgeStrips, ShellFaces, gauss, heights
 from magshell_fenicsx.parts.magnetism.magnetised_cells import (
     COMPLEX_STEP,
@@ -107,12 +107,14 @@ class ElementKind:
     ----------
     faces
         Whether the charges are those of faces.
+    family
+        The charged elements of the modelled cells: their faces, or strips along their edges.
     cells
         (copies * n,) numbers of the cells, with images.
     number
         (copies * all cells,) row of each cell in `cells`, or -1.
-    _modelled, _edge
-        The parameters `cells` (without images) and `edge`.
+    _modelled, _edge, _shape, _copies
+        The parameters `cells` (without images), `edge`, `shape` and `copies`.
     _rules
         Position of a rule in `DEGREES` -> its charged points.
     """
@@ -157,6 +159,7 @@ class ElementKind:
 
     def _face_rule(self, which: int) -> Points:
         """Return the charged points of a rule on faces, and on layers inside."""
+        # points in the reference triangle, their coordinates (a, b), and weights by these
         X, ab, weights = self._face_points(which)
         q = self.family.charges_at(Boxes.undivided(self.family.count), ab, weights).q
         assert isinstance(self.family, ShellFaces)
@@ -175,6 +178,7 @@ class ElementKind:
 
     def _strip_rule(self, which: int) -> Points:
         """Return the charged points of a rule on edges, whose points across are layers."""
+        # coordinates along the edge and across it, all pairs of both, and the weights of pairs
         s, eta, points, weights = self._strip_points(which)
         q = self.family.charges_at(Boxes.undivided(self.family.count), points, weights).q.reshape(
             -1, len(s), len(eta)
@@ -243,6 +247,7 @@ class ElementKind:
         shape of `Points.q` for the rule `which`. A height is the thickness times a fixed ratio. An
         image whose normals are turned over has opposite heights.
         """
+        # the rule's points (P, 2) in the reference triangle
         if self._edge is None:
             X, _, _ = self._face_points(which)
         else:
@@ -265,9 +270,10 @@ class ElementKind:
         They have charges q (cells, P, L) at reference points X (P, 2), in layers at the heights
         `eta` (L,) over the thickness.
         """
+        # (P, 3, k) shape functions with their derivatives, and (cells, P) the thickness
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
         X_of_cells = np.broadcast_to(X, (len(self._modelled), *X.shape))
-        thickness = self._shape.thickness(self._modelled, X_of_cells)[0]  # without derivatives
+        thickness, *_ = self._shape.thickness(self._modelled, X_of_cells)
         # where normals are turned over the thickness is negative, so that heights are opposite
         t_of_copies = np.concatenate([side * thickness for side in self._copies.normal_signs])
         q_of_copies = np.concatenate([factor * q for factor in self._copies.charge_factors])
@@ -310,6 +316,13 @@ class InteractingCharges:
         Middles and radii of the undeformed cells.
     _boxes
         The latest key of `boxes` with both results for it; None before the first.
+    _pairs
+        The compiled sums over pairs.
+    _singular_pairs, _stacked_faces
+        Adjacent cells (None if parts do not act on themselves), and cells that lie above each
+        other.
+    _shape, _h, _parts
+        The cells, their thickness over R, and the parameter `parts`.
     """
 
     def __init__(
@@ -337,11 +350,11 @@ class InteractingCharges:
             if (edges == edge).any()
         ]
         # kinds whose charges are rounding are left out; the coarsest rule, 0, shows that
-        charges = [element_kind.largest_charge(0) for element_kind in kinds]
+        largest_charges = [element_kind.largest_charge(0) for element_kind in kinds]
         self._kinds = [
             element_kind
-            for element_kind, charge in zip(kinds, charges, strict=True)
-            if include_uncharged or charge > CHARGE_TOLERANCE * max(charges)
+            for element_kind, charge in zip(kinds, largest_charges, strict=True)
+            if include_uncharged or charge > CHARGE_TOLERANCE * max(largest_charges)
         ]
         self._of_different_parts = np.asarray(parts[:, None] != parts)  # pairs of different parts
         # pairs that a Gauss rule or multipoles may serve: not a cell with itself or an adjacent one
@@ -351,6 +364,7 @@ class InteractingCharges:
             self._acts_by_rule[cell, adjacent_cells] = 0
         self._parts = parts
         assert isinstance(faces.family, ShellFaces)
+        # (copies * cells,) position of each cell in an order by the areas of parts
         order = _order_of_cells(shape, parts, len(copies.images))
         self._stacked_faces = StackedFaces(shape, faces.family, copies, parts, order, comm)
         # only images along the axes map boxes of the octree to boxes; other copies are groups that
@@ -386,11 +400,19 @@ class InteractingCharges:
         own_rows = slice(own_cells.start, own_cells.stop)
         _, is_too_near_for_multipoles = self.boxes(nodes, own_cells)
         has_rule = self._acts_by_rule[own_rows] & is_too_near_for_multipoles
+        # of these, the pairs of different parts that lie above each other
         is_stacked = self._stacked_faces.find_stacked(
             nodes, own_cells, has_rule & self._of_different_parts[own_rows]
         )
         has_rule &= ~is_stacked
-        limits = PairLimits(self._h, MIN_DISTANCE, ABOVE_TOLERANCE, BESIDE_SINE, too_near)
+        limits = PairLimits(
+            h=self._h,
+            space=MIN_DISTANCE,
+            above_tolerance=ABOVE_TOLERANCE,
+            flat=BESIDE_SINE,
+            worst=too_near,
+        )
+        # the number of each pair's rule; None if two cells are too near
         rules = self._pairs.rules(nodes, own_cells, has_rule, least_distances, limits)
         if rules is None:
             raise PartsTooNear
@@ -448,37 +470,31 @@ class InteractingCharges:
             If two parts overlap, or are too near for the size of their cells.
         """
         (rules, is_stacked), gradient = self.rules(nodes, own_cells), np.zeros_like(nodes)
-        multipoles = self.boxes(nodes, own_cells)[0]
+        # pairs that act by multipoles; derivatives are collected at points
+        multipoles, _ = self.boxes(nodes, own_cells)
         energy = multipoles.add(
             multipoles.place_charges(nodes), with_second_derivatives=stiffness is not None
         )
-        first, second = np.nonzero(rules >= 0)
-        rule_of_pair, first = rules[first, second], first + own_cells.start
-        is_own_pair = (second >= own_cells.start) & (
-            second < own_cells.stop
-        )  # such a pair stands in both orders
-        # of both orders one is counted, wholly
+        first, second, rule_of_pair = _pairs_with_rules(rules, own_cells)
+        # a pair of own cells stands in both orders, of which one is counted, wholly
+        is_own_pair = (second >= own_cells.start) & (second < own_cells.stop)
         shares = (is_own_pair & (first < second), 1.0), (~is_own_pair, 0.5)
         # pairs by rule, then by kind of elements (faces or edges) on the first and second cell
         for number, (counted, share) in product(np.unique(rule_of_pair), shares):
             is_counted = counted & (rule_of_pair == number)
             cells = np.column_stack([first[is_counted], second[is_counted]])
-            for first_kind, second_kind in product(self._kinds, self._kinds):
-                one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
-                is_charged = (one_row >= 0) & (other_row >= 0)
-                if first_kind.faces and second_kind.faces:  # stacked faces follow below
-                    is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
-                left, right = (
-                    (first_kind.rule(int(number)), one_row[is_charged]),
-                    (second_kind.rule(int(number)), other_row[is_charged]),
+            for kinds in product(self._kinds, self._kinds):
+                charged_cells, left, right = _charged_pairs(
+                    cells, kinds, int(number), is_stacked, own_cells
                 )
-                count = int(is_charged.sum())
+                count = len(charged_cells)
                 energy += share * self._pairs.add(
-                    nodes, cells[is_charged], count, left, right, gradient, stiffness
+                    nodes, charged_cells, count, left, right, gradient, stiffness
                 )
         # derivatives by points, which the sums have collected, are taken to the nodes
         for number, kind in product({MULTIPOLE_RULE, *np.unique(rule_of_pair)}, self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
+        # adjacent cells, and faces above each other
         if self._singular_pairs:
             energy += self._singular_pairs.add(nodes, gradient, stiffness)
         if is_stacked.any() and self._kinds[0].faces:
@@ -510,21 +526,22 @@ class InteractingCharges:
             (copies * cells, k, 3) deformed nodes and their rates.
         own_cells
             Cells of this rank.
+        weights
+            The factors of W and of v . dW/du.
 
         Raises
         ------
         PartsTooNear
             If two parts overlap, or are too near for the size of their cells.
         """
-        (rules, is_stacked), moved_nodes = (
-            self.rules(nodes, own_cells),
-            nodes + COMPLEX_STEP * 1j * rates,  # imaginary parts of results are rates along v
-        )
+        rules, is_stacked = self.rules(nodes, own_cells)
+        # complex nodes: imaginary parts of results are rates along v
+        moved_nodes = nodes + COMPLEX_STEP * 1j * rates
         nodal_derivatives = self._shape.zero_derivatives(of_shape=of_shape)
-        multipoles, cells_and_points = (
-            self.boxes(nodes, own_cells)[0],
-            [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds],
-        )
+        # pairs that act by multipoles: for each kind derivatives by its charges, and with
+        # `of_shape` by their heights
+        multipoles, _ = self.boxes(nodes, own_cells)
+        cells_and_points = [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds]
         by_far_charges = multipoles.charge_derivatives(
             nodes, moved_nodes, cells_and_points, weights, heights=of_shape
         )
@@ -532,32 +549,10 @@ class InteractingCharges:
             kind.add_derivatives(MULTIPOLE_RULE, by_charges, nodal_derivatives)
             for by_heights in by_all_heights:
                 kind.add_height_derivatives(MULTIPOLE_RULE, by_heights, nodal_derivatives)
-        first, second = np.nonzero(rules >= 0)
-        rule_of_pair, first = rules[first, second], first + own_cells.start
-        for number in map(int, np.unique(rule_of_pair)):
-            cells = np.column_stack([first, second])[rule_of_pair == number]
-            for first_kind, second_kind in product(self._kinds, self._kinds):
-                one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
-                is_charged = (one_row >= 0) & (other_row >= 0)
-                if first_kind.faces and second_kind.faces:
-                    is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
-                left, right = (
-                    (first_kind.rule(number), one_row[is_charged]),
-                    (second_kind.rule(number), other_row[is_charged]),
-                )
-                first_kind.add_derivatives(
-                    number,
-                    pair_derivatives(moved_nodes, cells[is_charged], left, right, weights)[0],
-                    nodal_derivatives,
-                )  # the other order is there
-                if of_shape:
-                    first_kind.add_height_derivatives(
-                        number,
-                        pair_derivatives(
-                            moved_nodes, cells[is_charged], left, right, weights, heights=True
-                        )[0],
-                        nodal_derivatives,
-                    )
+        self._add_near_derivatives(
+            moved_nodes, own_cells, rules, is_stacked, weights, nodal_derivatives, of_shape=of_shape
+        )
+        # adjacent cells, and faces above each other
         if self._singular_pairs:
             self._singular_pairs.field_derivatives(moved_nodes, weights, nodal_derivatives)
         if is_stacked.any() and self._kinds[0].faces:
@@ -565,6 +560,103 @@ class InteractingCharges:
                 nodes, own_cells, is_stacked, moved_nodes, weights, nodal_derivatives
             )
         return nodal_derivatives
+
+    def _add_near_derivatives(
+        self,
+        moved_nodes: Complex,
+        own_cells: range,
+        rules: NDArray[np.int8],
+        is_stacked: NDArray[np.bool_],
+        weights: Weights,
+        nodal_derivatives: NodalDerivatives,
+        *,
+        of_shape: bool,
+    ) -> None:
+        """Add derivatives of the pairs of cells with a Gauss rule to `nodal_derivatives`.
+
+        Each pair of cells comes in both orders, so that the derivatives by the charges of the first
+        cell are enough.
+
+        Parameters
+        ----------
+        moved_nodes
+            Deformed nodes, with rates as imaginary parts.
+        rules, is_stacked
+            (own cells, copies * cells) position of each pair's rule in `DEGREES`, negative without
+            one; and whether two cells have stacked faces, which are left out.
+        weights
+            The factors of the energy and of its rate.
+        of_shape
+            Whether derivatives by the heights of the charges are added too.
+        """
+        first, second, rule_of_pair = _pairs_with_rules(rules, own_cells)
+        for number in map(int, np.unique(rule_of_pair)):
+            cells = np.column_stack([first, second])[rule_of_pair == number]
+            for kinds in product(self._kinds, self._kinds):
+                charged_cells, left, right = _charged_pairs(
+                    cells, kinds, number, is_stacked, own_cells
+                )
+                first_kind, _ = kinds
+                by_charges, _ = pair_derivatives(moved_nodes, charged_cells, left, right, weights)
+                first_kind.add_derivatives(number, by_charges, nodal_derivatives)
+                if of_shape:
+                    by_heights, _ = pair_derivatives(
+                        moved_nodes, charged_cells, left, right, weights, heights=True
+                    )
+                    first_kind.add_height_derivatives(number, by_heights, nodal_derivatives)
+
+
+def _pairs_with_rules(
+    rules: NDArray[np.int8], own_cells: range
+) -> tuple[Ints, Ints, NDArray[np.int8]]:
+    """Return both cells of each pair that has a Gauss rule, and the position of the rule, (n,).
+
+    `rules` (own cells, copies * cells) are negative for pairs without one.
+    """
+    first, second = np.nonzero(rules >= 0)
+    return first + own_cells.start, second, rules[first, second]
+
+
+def _charged_pairs(
+    cells: Ints,
+    kinds: tuple[ElementKind, ElementKind],
+    rule: int,
+    is_stacked: NDArray[np.bool_],
+    own_cells: range,
+) -> tuple[Ints, tuple[Points, Ints], tuple[Points, Ints]]:
+    """Return the pairs of cells that have charged elements of two kinds, with their points.
+
+    Stacked faces are left out, as `StackedFaces` integrates them.
+
+    Parameters
+    ----------
+    cells
+        (n, 2) pairs of cells, the first ones own cells.
+    kinds
+        The kinds of elements on the first and on the second cell.
+    rule
+        Position of the rule in `DEGREES`.
+    is_stacked
+        (own cells, copies * cells) whether two cells have stacked faces.
+    own_cells
+        Cells of this rank.
+
+    Returns
+    -------
+    charged_cells
+        (m, 2) pairs of cells.
+    left, right
+        The charged points of the first and of the second kind, and the row (m,) of each cell's
+        element in them.
+    """
+    first_kind, second_kind = kinds
+    first_rows, second_rows = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
+    is_charged = (first_rows >= 0) & (second_rows >= 0)
+    if first_kind.faces and second_kind.faces:
+        is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
+    left = first_kind.rule(rule), first_rows[is_charged]
+    right = second_kind.rule(rule), second_rows[is_charged]
+    return cells[is_charged], left, right
 
 
 def _order_of_cells(shape: MagnetisedShell, parts: Ints, copies: int) -> Ints:

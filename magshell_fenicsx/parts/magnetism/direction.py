@@ -31,7 +31,8 @@ def directions(
     """Return unit vectors (steps + 1, 3) of the field before each step and after the last one.
 
     Row i is the direction before the step with the index i. The vectors are in a frame turned by
-    `turn` about e3 (rad). Without a field the first direction is e3.
+    `turn` about e3 (rad). Without a field the first direction is e3. A step that turns the field
+    gives a new direction, any other keeps that of before.
     """
     vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
@@ -57,7 +58,8 @@ def field_at(mu: Mapping[str, float]) -> Array:
 def straight(direction: Array) -> dict[str, Curve]:
     """Return amplitude -> curve for a field of strength t along a direction.
 
-    `direction` has a component for each amplitude of `FIELD` that exists.
+    `direction` has a component for each amplitude of `FIELD` that exists. A curve returns the
+    amplitude c t with its derivatives c and 0.
     """
 
     def curve(c: float) -> Curve:
@@ -72,8 +74,8 @@ def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
 
     `start` and `end` are unit vectors of the field's components, `size` is its signed magnitude.
     """
+    # the part of `end` across `start`: along it lies the direction after a turn by 90 degrees
     normal_part = end - (start @ end) * start
-    # the direction after a turn by 90 degrees
     quarter_turn = normal_part / np.linalg.norm(normal_part)
 
     def curve(b: float, a: float) -> Curve:
@@ -108,14 +110,17 @@ def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: flo
     `sense` is the sign of the field of the case. The angle is signed, from -180 to 180, if the
     field turns in one plane; else it is from 0 to 180.
     """
+    # a field in space: its direction follows from the rotations, each with an axis `turn`
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
-        direction = combined_motion(field.turns, mu)[0] @ first
+        rotation, *_ = combined_motion(field.turns, mu)
+        direction = rotation @ first
         normal = np.cross(first, direction)
         is_planar = all(np.abs(np.cross(axis, motion.turn)).max() < 1e-9 for motion in field.turns)
-        # sine of the angle, signed about the common axis
-        second = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
-        return degrees(atan2(second, float(first @ direction)))
+        # sine of the angle, with a sign if all rotations have one axis
+        sine = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
+        return degrees(atan2(sine, float(first @ direction)))
+    # else: components along the first direction, and across it
     along, second, third = (mu.get(name, 0.0) for name in FIELD)
     if not (second or third):
         return 0.0

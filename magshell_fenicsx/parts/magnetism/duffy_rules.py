@@ -67,6 +67,7 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
     sides = np.array([corners[j] - corners[i] for i, j in ENDS])
     points, weights = list[Array](), list[Array]()
     v, wv = gauss(RAY_POINTS)
+    # a sector has two vectors from the apex, along its first and its last ray
     for sector in _sectors(corners, is_inside):
         rays, angle_weights = _rays_of_sector(sector, sides, corners)
         # a ray is in the triangle from the length `low` to the length `high`
@@ -104,7 +105,7 @@ def _rays_of_sector(
     start = corners[ENDS[nearest_side][0]]
     normal = start - (start @ direction) * direction
     normal = normal / np.linalg.norm(normal)
-    # mu of a ray: sinh(mu) is the tangent of its angle from the side's normal
+    # a ray is given by mu: sinh(mu) is the tangent of its angle from the side's normal
     first_mu, last_mu = (np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B))
     x, w = gauss(SECTOR_POINTS + int(abs(last_mu - first_mu)))
     mu = first_mu + (last_mu - first_mu) * x
@@ -122,10 +123,11 @@ def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
     """
     if is_inside:
         return [(V[i], V[j]) for i, j in ENDS if _spanned_area(V[i], V[j]) > AREA_TOLERANCE]
+    # angles of the corners from the direction to the middle, in ascending order
     to_middle = V.mean(axis=0)
-    angle = [np.arctan2(_spanned_area(to_middle, v), to_middle @ v) for v in V]
-    order = np.argsort(angle)
-    return [(V[i], V[j]) for i, j in pairwise(order) if angle[j] - angle[i] > AREA_TOLERANCE]
+    angles = [np.arctan2(_spanned_area(to_middle, v), to_middle @ v) for v in V]
+    order = np.argsort(angles)
+    return [(V[i], V[j]) for i, j in pairwise(order) if angles[j] - angles[i] > AREA_TOLERANCE]
 
 
 def _ray_lengths(sides: Array, corners: Array, rays: Array) -> Array:
@@ -154,16 +156,16 @@ def rule_along_sides(dense_sides: tuple[bool, bool, bool], s: float) -> tuple[Ar
 
     The triangle is divided into three by its centre. The points of a part are dense at its side, on
     the scale 3 s, if `dense_sides` (in the order of local edges) is true; else the part has a
-    coarse rule. Points are (n, 2), weights (n,).
+    coarse rule. Points are (n, 2), weights (n,). Without dense sides the triangle is not divided.
     """
     if not any(dense_sides):
         X, w = basix.make_quadrature(basix.CellType.triangle, INNER_DEGREE)
         return np.asarray(X), np.asarray(w)
     points, weights, centre = list[Array](), list[Array](), CORNERS.mean(axis=0)
-    for (i, j), is_free in zip(ENDS, dense_sides, strict=True):
+    for (i, j), is_dense in zip(ENDS, dense_sides, strict=True):
         # a runs from the side to the centre, b along the side
-        a, wa = graded(POINTS_FROM_FREE_EDGE, 3 * s) if is_free else gauss(3)
-        b, wb = gauss(POINTS_ALONG_FREE_EDGE if is_free else 3)
+        a, wa = graded(POINTS_FROM_FREE_EDGE, 3 * s) if is_dense else gauss(3)
+        b, wb = gauss(POINTS_ALONG_FREE_EDGE if is_dense else 3)
         side = CORNERS[i] + b[:, None] * (CORNERS[j] - CORNERS[i])
         points.append(((1 - a)[:, None, None] * side + a[:, None, None] * centre).reshape(-1, 2))
         weights.append(np.outer(wa * (1 - a), wb).ravel() / 3)
@@ -178,10 +180,10 @@ def at_corner(corner: int) -> tuple[Array, Array]:
     """
     (a, wa), (b, wb) = gauss(6), gauss(5)  # more points towards the corner
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
-    side = A - V + b[:, None] * (B - A)
-    return (V + a[:, None, None] * side).reshape(-1, 2), np.asarray(
-        np.outer(wa * a, wb).ravel(), dtype=np.float64
-    )
+    to_side = A - V + b[:, None] * (B - A)  # from the corner to places of the opposite side
+    points = (V + a[:, None, None] * to_side).reshape(-1, 2)
+    # the Jacobian of the transform is a, as twice the area of the triangle is 1
+    return points, np.asarray(np.outer(wa * a, wb).ravel(), dtype=np.float64)
 
 
 def on_edge(edge: int, t: Array) -> Array:
@@ -251,6 +253,7 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
         for height, weight in zip(heights, height_weights, strict=True):
             # a row of points at this height, dense at t on this scale, by a rule in v
             scale = s * max(abs(height - eta), min_scale)
+            # segments on both sides of t: from and to which distance, and in which direction
             for start, end, sign in segments:
                 bottom, top = np.arcsinh(start / scale), np.arcsinh(end / scale)
                 r = bottom + (top - bottom) * v

@@ -106,6 +106,7 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
     `turn` (rad) is the angle about e3 by which this frame is turned from that of the case.
     """
     sections: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
+    # flux densities of a remanence of length one, and of lambda_m = 1; and the name of their unit
     tesla_of_remanence, tesla_of_lambda = units(context)
     R, unit = context.shell.reference, unit_of_readings(context)
     maps = list[FieldMap]()
@@ -118,10 +119,11 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
             unit,
             section.field,
         )
+        places_in_model = grid.places @ rotation(turn).T
         maps.append(
             FieldMap(
                 grid,
-                grid.places @ rotation(turn).T,
+                places_in_model,
                 total=section.field == "total",
                 own=tesla_of_remanence,
                 applied=tesla_of_lambda,
@@ -131,7 +133,11 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
 
 
 def unit_of_readings(context: Context) -> str:
-    """Return the unit of flux densities that are read: "T", "sqrt(mu0 E)" or "|Br|"."""
+    """Return the unit of flux densities that are read: "T", "sqrt(mu0 E)" or "|Br|".
+
+    It is T where the case has flux densities. Without them it is |Br|, or sqrt(mu0 E) of a shell
+    without remanence.
+    """
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic and magnetic.remanent is None:
         return "T" if E and magnetic.lambda_m is None else "sqrt(mu0 E)"

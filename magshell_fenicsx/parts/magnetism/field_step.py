@@ -211,13 +211,13 @@ class RotationSection(Step):
         end = direction.components(end_vector, field)
         size = float(start @ direction.field_at(step_start.mu))  # signed magnitude of the field
         total = acos(float(start_vector @ end_vector))
-        # the requested points, without the begin of the step
+        # the requested angles, without that of the begin of the step
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive(
-            "arc",
-            "load",
-            total,
-            targets,
+            control="arc",
+            quantity="load",
+            end=total,
+            targets=targets,
             first=total / self.points,
             scale=total / self.points,
         )
@@ -229,6 +229,7 @@ class RotationSection(Step):
             angle = direction.field_angle(mu, field) % 360
             return f"the turning field makes the shell unstable at {angle:.4g} degrees: {what}"
 
+        # a field in space turns by one amplitude, a uniform one by all components along a circle
         rotates_as_whole = field and field.turns
         curves = (
             direction.as_a_whole(turn_name(step_start.step), total)
@@ -249,6 +250,8 @@ class RotationSection(Step):
             directions,
         )  # the solver takes long to import
 
+        # before each step and after the last one: at the begin of the programme and of the step,
+        # and at the end of the step
         all_directions = directions(context.steps, loads.magnetic, turn)
         first, start, end = (all_directions[i] for i in (0, step.number - 1, step.number))
         angle = degrees(acos(float(np.clip(end @ first, -1, 1))))

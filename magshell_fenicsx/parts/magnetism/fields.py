@@ -394,7 +394,7 @@ class MagneticSection(Section, Ability):
             )
         if self.remanent and isinstance(self.remanent.components, UserField):
             context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
-        # values of the remanence: a shell knows the average of layers alone, a solid has them all
+        # of a layered remanence a shell has the average over the thickness alone, a solid has all
         layers = self.remanent.layers if self.remanent else None
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -406,10 +406,10 @@ class MagneticSection(Section, Ability):
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime:
-        """Return the field as a load in time.
+        """Return the field as a load that may be a function of time.
 
-        `driven` are the amplitudes that earlier steps drive. The second entry of the result is the
-        reason why the field may not be a load in time, "" if it may.
+        `driven` are the amplitudes that earlier steps drive. The result has the name "field", and
+        the reason why the field may not be a load in time, "" if it may.
         """
         refused_because = "not after kind: rotation" if ANGLE in driven else ""
         if not strength(context):
@@ -437,9 +437,11 @@ class MagneticSection(Section, Ability):
         )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
+        # this constraint has only a reason why the problem is not axisymmetric
         interacting = (
             [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         )
+        # whether the magnetisation matters: a field acts on it, it is read, or parts interact
         is_visible = strength(context) or is_read(context) or interacting
         return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
@@ -483,9 +485,6 @@ class MagneticSection(Section, Ability):
             With the key and the first place of a value that is not finite or too large.
         """
         from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
-        from magshell_fenicsx.parts.magnetism.sources.field import (
-            placed_sources,
-        )  # the solver takes long to import
 
         refuse_unfit_interaction(context)
         lambda_m = strength(context)
@@ -496,25 +495,19 @@ class MagneticSection(Section, Ability):
                 f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
                 f"{MIN_LAMBDA:g} to {largest:g}"
             )
-        for source in placed_sources(context):
-            B, *_ = source(places)
-            is_finite = np.isfinite(B).all(axis=1)
-            is_too_strong = (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
-            # values that are not finite have another message
-            strong_places = places[is_finite & is_too_strong]
-            if len(strong_places):
-                x, y, z = strong_places[0]
-                raise CaseError(
-                    f"{source.key}: its field is above {MAX_FIELD_RATIO:g} times the unit of the "
-                    f"field at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
-                )
-            bad_places = places[~is_finite]
-            if len(bad_places):
-                x, y, z = bad_places[0]
-                raise CaseError(
-                    f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) "
-                    f"{source.nowhere}; see its position"
-                )
+        _refuse_unfit_sources(context, places)
+        self._refuse_unfit_formulas(places)
+
+    def _refuse_unfit_formulas(self, places: Array) -> None:
+        """Refuse formulas of remanence and applied field without a finite value, or above 1e6.
+
+        They are evaluated at places (n, 3) over R.
+
+        Raises
+        ------
+        CaseError
+            With the key and the first place of such a value.
+        """
         components = {
             "remanent": self.remanent and self.remanent.components,
             "applied": self.applied.components,
@@ -598,3 +591,36 @@ def strength(context: Context) -> float:
     """Return lambda_m of a case; 0 without a field."""
     magnetic = context.section_of(MagneticSection)
     return magnetic.amplitude(context.shell.youngs_modulus) if magnetic else 0.0
+
+
+def _refuse_unfit_sources(context: Context, places: Array) -> None:
+    """Refuse sources whose field is not finite, or too strong, at places (n, 3) over R.
+
+    Raises
+    ------
+    CaseError
+        With the key of the source and the first such place.
+    """
+    from magshell_fenicsx.parts.magnetism.sources.field import (
+        placed_sources,
+    )  # the solver takes long to import
+
+    for source in placed_sources(context):
+        B, *_ = source(places)
+        is_finite = np.isfinite(B).all(axis=1)
+        is_too_strong = (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
+        # values that are not finite have another message
+        strong_places = places[is_finite & is_too_strong]
+        if len(strong_places):
+            x, y, z = strong_places[0]
+            raise CaseError(
+                f"{source.key}: its field is above {MAX_FIELD_RATIO:g} times the unit of the "
+                f"field at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
+            )
+        bad_places = places[~is_finite]
+        if len(bad_places):
+            x, y, z = bad_places[0]
+            raise CaseError(
+                f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) "
+                f"{source.nowhere}; see its position"
+            )

@@ -147,6 +147,7 @@ class ForceExtrapolation:
             self._rotate_stiffness(u, D, u_of_D)
         self._model = self._model or self._make_model()
         polynomial, secants = self._model
+        # D u and the remainder by the polynomial; then a correction by each secant (q, y)
         forces, s = self._product(u) + polynomial.remainder(u), u - polynomial.base.u
         for q, y in secants:
             forces = forces + (q @ s) * y
@@ -159,6 +160,8 @@ class ForceExtrapolation:
         """
         if not self._points or self._is_new_point(u):
             return False
+        # pairs of states of the last point that follow one another: near each other and near u,
+        # and different along the step
         largest_distance = SLOPE_DISTANCE_RATIO * self._distances[-1]
         step_length = float(np.linalg.norm(step))
         for state, next_state in pairwise(self._points[-1]):
@@ -182,14 +185,14 @@ class ForceExtrapolation:
         Nothing is done if no node has rotated by `ROTATION_TOLERANCE` since the last time. Else, as
         D u changes, the products with all stored states are computed again.
         """
-        earlier_u = self._rotated_u if D is self._D else None
+        earlier_u = self._rotated_u if D is self._D else None  # None: D is a new one
         if earlier_u is not None:
             # twice the vector part of a quaternion is a small angle in rad
             largest_angle = 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max()
             if largest_angle < ROTATION_TOLERANCE:
                 return
-        rotated = D.rotated_blocks(self._rotations(u, u_of_D))
-        if rotated is None and earlier_u is not None:  # D cannot be rotated and is stored already
+        rotated = D.rotated_blocks(self._rotations(u, u_of_D))  # None if D cannot be rotated
+        if rotated is None and earlier_u is not None:  # D is stored already, as it is
             return
         self._D, self._rotated_u = D, u
         self._stored = (
@@ -223,7 +226,8 @@ class ForceExtrapolation:
                 - polynomial.remainder(state.u)
                 + polynomial.remainder(older_state.u)
             )
-            # Gram-Schmidt, twice because of rounding; y changes along with s
+            # Gram-Schmidt: s less its parts along newer changes q, and y less what these explain;
+            # twice because of rounding
             for _ in range(2):
                 for q, y_of_q in secants:
                     projection = float(q @ s)
@@ -278,8 +282,8 @@ class PathPolynomial:
         base, previous = points[-1][-1], points[-2][-1] if len(points) > 1 else None
         if previous is None or np.array_equal(previous.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
-        direction, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
-        direction = np.asarray(direction / distance)
+        way, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
+        direction = np.asarray(way / distance)
 
         def position_and_length(s: Array) -> tuple[float, float]:
             """Return a change's part along the direction, and its length, both over `distance`."""
@@ -289,7 +293,8 @@ class PathPolynomial:
         rows, values, positions = list[Array](), list[Array](), [0.0]
         powers = np.arange(1.0, MAX_COEFFICIENTS + 1)
         for point in reversed(points):
-            # the value at the last state of the point; that of the newest point is the constant
+            # an equation for the value at the last state of the point, unless that is the base,
+            # whose value is the constant
             last = point[-1]
             position, length = position_and_length(last.u - base.u)
             if last is not base:
@@ -300,7 +305,8 @@ class PathPolynomial:
                 positions.append(position)
                 rows.append(np.asarray(position**powers))
                 values.append(last.remainder - base.remainder)
-            # the mean slope between the first two states that are near each other along the path
+            # an equation for the mean slope between two states that are near each other and along
+            # the path, of the newest such pair
             for state, older_state in pairwise(reversed(point)):
                 step, length = position_and_length(state.u - older_state.u)
                 is_slope = MIN_ALONG_SHARE * length < abs(step) and length < SLOPE_DISTANCE_RATIO

@@ -73,6 +73,32 @@ def polar(F: Array) -> Array:
     return np.asarray(U @ V)
 
 
+def _mark_blocks(
+    pattern: NDArray[np.bool_],
+    row_of: Ints,
+    column_of: Ints,
+    own_cells: range,
+    pairs: NDArray[np.bool_],
+) -> None:
+    """Set a pattern (rows, columns) to true for the nodes of pairs of cells.
+
+    Each own cell is also paired with itself.
+
+    Parameters
+    ----------
+    row_of, column_of
+        (cells, k) and (copies * cells, k) numbers of the nodes of cells as rows and as columns.
+    own_cells
+        Cells of this rank.
+    pairs
+        (own cells, copies * cells) whether two cells are a pair.
+    """
+    for cell, is_partner in zip(own_cells, pairs, strict=True):
+        partners = np.append(np.flatnonzero(is_partner), cell)
+        columns = np.unique(column_of[partners])
+        pattern[row_of[cell][:, None], columns] = True
+
+
 class InteractionTerm:
     """Energy over E h R² of the parts of a model in each other's field, and in their own.
 
@@ -103,6 +129,11 @@ class InteractionTerm:
         first.
     _even_term
         For a term from `antisymmetric`, the term that it was made from; else None.
+    _charges, _singular_pairs, _copies, _corners, _part_of_cells
+        Made at their first use: the charges, the pairs of adjacent cells, the modelled part with
+        its images, and the corners and the part of each cell.
+    _extrapolation
+        Forces at earlier states, from which others are extrapolated.
 
     Raises
     ------
@@ -186,14 +217,16 @@ class InteractionTerm:
 
     def energy(self) -> float:
         """Return this rank's part of the energy; collective."""
-        return self._evaluated()[0]
+        energy, _ = self._evaluated()
+        return energy
 
     def compile_residual(self) -> None:
         """Compile nothing: the residual is a sum over pairs of charges."""
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor dPi/du of this rank's cells to b, with ghosts; collective."""
-        b += factor * self._evaluated()[1]
+        _, forces = self._evaluated()
+        b += factor * forces
 
     def add_extrapolated_residual(self, b: Array, factor: float) -> None:
         """Add factor dPi/du to b, extrapolated from forces at earlier states; collective.
@@ -237,11 +270,11 @@ class InteractionTerm:
         If `inexact`, it may be that of an earlier state. A term from `antisymmetric` returns the
         derivative by odd changes.
         """
-        return (
-            self._even_term.even_and_odd_hessians(inexact=inexact)[1]
-            if self._even_term
-            else self.even_and_odd_hessians(inexact=inexact)[0]
-        )
+        if self._even_term:
+            _, odd_hessian = self._even_term.even_and_odd_hessians(inexact=inexact)
+            return odd_hessian
+        even_hessian, _ = self.even_and_odd_hessians(inexact=inexact)
+        return even_hessian
 
     def even_and_odd_hessians(
         self, *, inexact: bool
@@ -252,7 +285,7 @@ class InteractionTerm:
         at the present state unless `inexact`: then the latest ones are returned, if there are any.
         """
         nodes = self._nodes()
-        latest = self._latest_hessians
+        latest = self._latest_hessians  # nodes, both second derivatives, and u there
         # if `inexact`, those at any earlier nodes will do
         if latest is None or not (inexact or np.array_equal(nodes, latest[0])):
             latest = self._latest_hessians = None  # the old ones free their memory first
@@ -284,11 +317,14 @@ class InteractionTerm:
             term does not depend on a field of that name.
         """
         field_of_model, of_shape = self_field(self._view), name in ("thickness", "r0")
+        # deformed nodes of all copies; the direction v at the modelled nodes, and then at all
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         rates_of_copies = np.concatenate([rates @ image.Q.T for image in self._copies.images])
         weights = Weights(energy=self._scale * energy, force=self._scale * force)
         own_cells = self._cells.own_range
         own_rows = slice(own_cells.start, own_cells.stop)
+        # by the shape: through the charges and their heights, summed over ranks; a change of place
+        # also moves the charges
         if of_shape:
             nodal_derivatives = self._charges.field_derivatives(
                 nodes, rates_of_copies, own_cells, weights, of_shape=True
@@ -303,6 +339,7 @@ class InteractionTerm:
             return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
         if name != field_of_model.Br.name:
             return None
+        # by the remanence: through the charges, also of elements that have none now
         by_remanence = (
             self._charges_of_all_elements()
             .field_derivatives(nodes, rates_of_copies, own_cells, weights)
@@ -346,9 +383,9 @@ class InteractionTerm:
         """
         V, count = self._u.function_space, len(self._cells.own_range)
         D, v = self.hessian(), global_values(direction).ravel()
-        by_nodes = energy * self._evaluated()[1] + force * (
-            D.near_blocks @ v + D.times_far(v[:, None]).ravel()
-        )
+        _, gradient = self._evaluated()
+        # D v is the sum of the stored blocks' part and of the multipoles' part
+        by_nodes = energy * gradient + force * (D.near_blocks @ v + D.times_far(v[:, None]).ravel())
         nodes = V.dofmap.list[:count]
         # the number of own cells at each node; nodes of ghost cells alone are not used
         cells_of_node = np.bincount(nodes.ravel(), minlength=len(by_nodes) // 3)
@@ -372,21 +409,17 @@ class InteractionTerm:
         image_transforms = np.stack([image.Q for image in images])
         local_count = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         multipoles, near_cells = self._charges.boxes(nodes, own_cells)
+        # blocks of nodes of near cells are stored; those of adjacent cells serve extrapolation. A
+        # node of an image stands in the column of the modelled node
         has_block = np.zeros((local_count, count), dtype=bool)
         adjacent = np.zeros((count, count), dtype=bool)
-        # blocks of nodes of near cells are stored; those of adjacent cells serve extrapolation
-        for pattern, row_numbers, pairs in (
-            (has_block, row_of, near_cells),
-            (adjacent, self._cells.nodes, multipoles.adjacent_cells(own_cells)),
-        ):
-            for cell, acts_on_cell in zip(own_cells, pairs, strict=True):
-                partners = np.append(np.flatnonzero(acts_on_cell), cell)
-                # a node of an image stands in the column of the modelled node
-                columns = np.unique(column_of[partners] % count)
-                rows = row_numbers[cell]
-                pattern[rows[:, None], columns] = True
+        modelled_column_of = column_of % count
+        _mark_blocks(has_block, row_of, modelled_column_of, own_cells, near_cells)
+        adjacent_cells = multipoles.adjacent_cells(own_cells)
+        _mark_blocks(adjacent, self._cells.nodes, modelled_column_of, own_cells, adjacent_cells)
         # the same blocks on any number of ranks
         self._comm.Allreduce(MPI.IN_PLACE, adjacent, MPI.LOR)
+        # second derivatives of near pairs of cells are added to the blocks
         stiffness = Stiffness(has_block, self._scale, row_of, column_of, image_transforms)
         try:
             self._charges.evaluate(nodes, own_cells, stiffness)
@@ -394,23 +427,24 @@ class InteractionTerm:
             stiffness.blocks[:] = np.nan
         node_numbers = V.dofmap.index_map.local_to_global(np.arange(local_count, dtype=np.int32))
         cells = CellNodes(
-            self._cells.nodes,
-            own_cells,
-            row_of[own_cells.start : own_cells.stop],
-            node_numbers,
-            image_transforms,
+            nodes=self._cells.nodes,
+            own=own_cells,
+            rows=row_of[own_cells.start : own_cells.stop],
+            numbers=node_numbers,
+            turn=image_transforms,
         )
+        # the multipoles' part is not stored, but multiplied by means of these derivatives
         multipole_jacobian = multipoles.jacobian(multipoles.place_charges(nodes))
         even_hessian, odd_hessian = (
             InteractionHessian(
-                stiffness,
-                multipoles,
-                multipole_jacobian,
-                self._scale,
-                cells,
-                sign,
-                adjacent[node_numbers][has_block],
-                self._turning,
+                near=stiffness,
+                far=multipoles,
+                B=multipole_jacobian,
+                scale=self._scale,
+                cells=cells,
+                sign=sign,
+                is_adjacent=adjacent[node_numbers][has_block],
+                block_rotation=self._turning,
             )
             for sign in ([1.0, -1.0] if has_images else [1.0, 1.0])
         )
@@ -448,7 +482,7 @@ class InteractionTerm:
         forces for extrapolation.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
-        # the charges depend on these: placement, remanence, and perhaps the thickness
+        # the inputs of the charges: placement, remanence, and perhaps the thickness, of all cells
         Br, thickness = self_field(self._view).Br, self._model.thickness
         remanence_of_cells = Br.x.array.reshape(-1, 3)[Br.function_space.dofmap.list]
         inputs: tuple[Array, ...] = (r0, self._cells.gather_values(remanence_of_cells))
@@ -483,7 +517,8 @@ class InteractionTerm:
             a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
             return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
 
-        # sum of deformation gradients of all cells at a node; its nearest rotation is returned
+        # sum over the cells at a node of the changes of their frames from `u_before` to u, which
+        # are deformation gradients; the rotation nearest to this sum is returned
         F = np.zeros((len(r0), 3, 3))
         np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(u_before)))
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
@@ -526,7 +561,13 @@ class InteractionTerm:
             element, _ = shape.thickness_factor
             factor = element, thickness_factor[0]
         all_cells = MagnetisedShell(
-            shape.element, r0, 0 * r0, shape.remanence_element, remanence, shape.h, factor
+            element=shape.element,
+            r0=r0,
+            u=0 * r0,
+            remanence_element=shape.remanence_element,
+            remanence=remanence,
+            h=shape.h,
+            thickness_factor=factor,
         )
         own_cells, comm = np.asarray(cells) + self._cells.own_range.start, self._comm
         return all_cells, gather_rows(comm, own_cells), gather_rows(comm, np.asarray(edges))

@@ -93,7 +93,10 @@ def acts(context: Context) -> bool:
 
 
 def interaction(context: Context) -> Interaction | None:
-    """Return the strength of a case's interaction and what acts on what; None without one."""
+    """Return a case's interaction: its strength, and whether parts act on themselves too.
+
+    None without an interaction.
+    """
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None or not acts(context):
         return None

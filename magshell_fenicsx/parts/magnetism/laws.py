@@ -32,9 +32,10 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     r, n0, up = r0 + u, kin.normal(r0), kin.dual_basis(r0)
     n, area0 = kin.normal(r), kin.area_ratio(r0)
     J = kin.area_ratio(r) / area0
-    trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))
+    trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))  # of C
+    # F Br and J F C^-1 Br, of the part of Br in the surface. Their sum over T = sqrt(tr C + 2 J) is
+    # R of this part; its part along n0 turns to n
     in_surface = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
-    # F Br and J F C^-1 Br in the surface; the sum over T is the rotated part of Br there
     cofactor_part = (
         ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)
     ) / area0
@@ -54,7 +55,8 @@ def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Return the term Uq of a remanence that only rotates.
 
-    It is quadratic in the rotations: q_i = n0 . u,_i of the normal, and w in the surface.
+    It is quadratic in the rotations: q_i = n0 . u,_i of the normal, and w in the surface. It is the
+    term of a remanence that moves with F, and further products of rotations.
     """
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
@@ -70,9 +72,9 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     The normal part of the remanence contributes rotations times surface gradients of u. Its part
     in the surface contributes rotations times strains (`stretched`, `widened`).
     """
-    n0, q = kin.normal(r0), densities.rotation(r0, u)
+    n0, q = kin.normal(r0), densities.rotation(r0, u)  # q is a vector in the surface
     up1, up2 = kin.dual_basis(r0)
-    in_surface = Br - ufl.dot(n0, Br) * n0
+    in_surface = Br - ufl.dot(n0, Br) * n0  # the part of the remanence in the surface
     along_q = ufl.dot(q, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br))
     along_Br = ufl.dot(in_surface, u.r1 * ufl.dot(up1, q) + u.r2 * ufl.dot(up2, q))
     stretched = ufl.dot(n0, Ba) * (along_q + along_Br) / 2

@@ -116,29 +116,27 @@ def magnetisation(
         If a file of vectors or of a source cannot be read.
     """
     section = magnetic.remanent or RemanentSection.model_construct()
-    gradient = magnetic.applied.gradient
+    # a field in space at rest (None without one), and further ones that amplitudes move
     field, moving_fields = in_space(context, turn)
+    # flux densities of a remanence of length one, and of lambda_m = 1; nan if not known
     tesla_of_remanence, tesla_of_lambda = units(context)
-    # a field in space has one direction and turns as a whole
+    # unit vectors along the field's directions: the first one, and across it those it turns to. A
+    # field in space has one direction and turns as a whole
     later_directions = [] if field else [direction.vector(turn) for direction in to]
     basis = _orthonormal_basis(magnetic.applied.vector(turn), later_directions)
-    applied, *other_components = (magnetic.applied.uniform * e for e in basis)
-    patches = None
-    if section.patches and isinstance(context.shell, MeshSurface):
-        patches = {
-            name: _on_patch(direction, context, turn) for name, direction in section.patches.items()
-        }
+    applied, *across = (magnetic.applied.uniform * e for e in basis)
+    # remanences of the patches of a mesh; those of dimples are in the pattern of `_remanence`
+    patches = _on_patches_of_mesh(section, context, turn)
     remanent = _remanence(section, context, turn, patch_rims) if magnetic.remanent else np.zeros(3)
-    Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    # the gradient's tensor in the turned frame; a field in space has its own gradient
-    G = Q @ np.array(gradient) @ Q.T if gradient and not field else None
+    has_metres = context.shell.with_units and np.isfinite(tesla_of_lambda)
     return Magnetisation(
         remanent,
         applied,
         energy=magnetic.energy,
-        gradient=G,
-        across=tuple(other_components),
+        # a field in space has its own gradient
+        gradient=None if field else _gradient(magnetic, turn),
+        across=tuple(across),
         patches=patches,
         layers=layers,
         law=magnetic.remanence,
@@ -149,11 +147,24 @@ def magnetisation(
         given=section.components if isinstance(section.components, UserField) else None,
         soft=soft_magnet(context, turn, patch_rims),
         tesla=tesla_of_remanence if np.isfinite(tesla_of_remanence) else 1.0,
-        metres=context.shell.reference
-        if context.shell.with_units and np.isfinite(tesla_of_lambda)
-        else 0.0,
+        metres=context.shell.reference if has_metres else 0.0,
         absent=magnetic.lambda_m == 0 and not is_read(context),
     )
+
+
+def _gradient(magnetic: MagneticSection, turn: float) -> Array | None:
+    """Return the gradient (3, 3) of the applied field in the turned frame; None without one."""
+    gradient, Q = magnetic.applied.gradient, rotation(turn)
+    return Q @ np.array(gradient) @ Q.T if gradient else None
+
+
+def _on_patches_of_mesh(
+    section: RemanentSection, context: Context, turn: float
+) -> dict[str, Array | Pattern] | None:
+    """Return name of each patch of a mesh -> its remanence; None without such patches."""
+    if not (section.patches and isinstance(context.shell, MeshSurface)):
+        return None
+    return {name: _on_patch(patch, context, turn) for name, patch in section.patches.items()}
 
 
 def _orthonormal_basis(first: Array, directions: Sequence[Array]) -> list[Array]:
@@ -203,8 +214,10 @@ def soft_magnet(
         scale = sqrt(MU_0 * E) / remanent.flux_density
     # T for lambda_m = 1
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
-    largest = None if magnetic.saturation is None else magnetic.saturation / tesla
-    return SoftMagnet(pattern, scale, tesla, remanent is None, patches or None, largest)
+    largest_polarisation = None if magnetic.saturation is None else magnetic.saturation / tesla
+    return SoftMagnet(
+        pattern, scale, tesla, remanent is None, patches or None, largest_polarisation
+    )
 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
@@ -223,9 +236,9 @@ def _on_patch(section: Direction, context: Context, turn: float) -> Array | Patt
     """
     if not isinstance(section, RemanentSection) or section.of_shell is None:
         return section.vector(turn)
-    place, factor = section.of_shell
+    place, factor = section.of_shell  # the pose of the shell, and a factor of its remanence
     # in the shell's own frame there is no turn and no dimple
-    remanence = _remanence(section, context, 0.0, {})
+    remanence = _remanence(section, context, turn=0.0, patch_rims={})
     return (
         factor * remanence @ place.Q.T
         if isinstance(remanence, np.ndarray)
@@ -301,10 +314,11 @@ class _MagneticVectors:
 
     def has_mirror(self, mirror: Mirror, outline: Outline) -> bool:
         """Return whether a plane maps remanence and field to themselves or both to opposites."""
+        # places (n, 3) at which fields that vary are compared; none are needed without such fields
         x = outline.sample() if self.fields or self.sources else np.zeros((0, 3))
         if self.is_beside_surface:
             x = with_nearby_places(x)
-        return self._has_images(mirror, x, 1.0) or self._has_images(mirror, x, -1.0)
+        return self._has_images(mirror, x, sign=1.0) or self._has_images(mirror, x, sign=-1.0)
 
     def _has_images(self, mirror: Mirror, x: Array, sign: float) -> bool:
         """Return whether mirror images are `sign` times the vectors, at places x (n, 3)."""
@@ -332,7 +346,9 @@ class _MagneticVectors:
         A radial remanence is its own mirror image. A tangential one is so for planes through its
         axis, and its opposite for planes normal to that. S is the reflection (3, 3).
         """
+        # of the section's own kind, about e3; S[2, 2] is 1 for planes through e3, -1 across it
         sign_of_kind = {"radial": 1.0, "tangential": float(S[2, 2])}
+        # of patches with patterns, each about the axis of its own frame
         for pattern in self.patterns.values():
             axis = pattern.place.Q[:, 2]
             if pattern.pattern is radial and sign != 1.0:
@@ -359,10 +375,11 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
             mirror, outline
         )
 
-    reasons = _reasons_not_axisymmetric(magnetic, vectors, outline)
+    first_reason = next(_reasons_not_axisymmetric(magnetic, vectors, outline), None)
+    # vectors that a mirror plane must contain
     axes_of_sources = _vectors_of_sources(magnetic.applied.sources or [], context.shell.reference)
     in_plane = [*vectors.vectors, *axes_of_sources]
-    return [SymmetryConstraint(next(reasons, None), in_plane, mirrors)]
+    return [SymmetryConstraint(first_reason, in_plane, mirrors)]
 
 
 def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticVectors:
@@ -370,7 +387,8 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
     applied, remanent = magnetic.applied, magnetic.remanent
     formulas = applied.components if applied.has_field_beside_sources else None
     directions = remanent.directions() if remanent else []
-    remanences = [_on_patch(direction, context, 0.0) for direction in directions]
+    remanences = [_on_patch(direction, context, turn=0.0) for direction in directions]
+    # uniform vectors: of the remanence, and of a uniform applied field
     vectors = [remanence for remanence in remanences if not callable(remanence)]
     if applied.has_field_beside_sources and not formulas and strength(context):
         vectors.append(applied.vector())
@@ -381,6 +399,7 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
         if isinstance(remanence, PosedPattern)
     }
+    # fields that vary: of the gradient, of formulas, of points and of patches
     G = np.array(applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
@@ -420,6 +439,7 @@ def _reasons_not_axisymmetric(
     if vectors.by_points and not vectors.by_points.controls.is_axisymmetric:
         yield "the remanence is given at points in space"
     for name, pattern in _varying_patterns(vectors.patterns).items():
+        # the pattern of a patch is looked at on the meridian of its shell
         meridian = outline.meridian
         if meridian:
             meridians = [m for m in meridian.shell_meridians if name.startswith(m.name)]

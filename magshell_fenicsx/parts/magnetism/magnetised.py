@@ -105,12 +105,15 @@ class Magnetisation:
         lambda_m = mu.get("lambda_m", 0.0)
         if self.in_space and not lambda_m:  # lambda_m multiplies all of it
             return np.zeros_like(r)
+        # a field in space, with what is driven: the first entries are B, without derivatives
         if self.in_space:
             x = r.reshape(-1, 3)
-            B = self.in_space(x)[0] + sum(
+            B_at_rest, *_ = self.in_space(x)
+            B = B_at_rest + sum(
                 (field.field_at(x, mu).value[0] for field in self.driven), np.zeros(3)
             )
             return np.asarray(lambda_m * B.reshape(r.shape))
+        # a uniform field by its components, and perhaps a gradient
         uniform = lambda_m * self.applied
         for name, component in zip(TRANSVERSE_AMPLITUDES, self.across, strict=False):
             uniform = uniform + mu.get(name, 0.0) * component
@@ -147,7 +150,8 @@ class Magnetisation:
             If there is no such patch.
         """
         remanent = by_patch(self.patches, patches, cells) if self.patches else self.remanent
+        # the soft material in the same way: its values on patches become a pattern of cells
         soft = self.soft and self.soft.with_patches(
-            lambda of: by_patch(of, patches, cells, "magnetic.susceptibility")
+            lambda values: by_patch(values, patches, cells, "magnetic.susceptibility")
         )
         return replace(self, remanent=remanent, soft=soft)

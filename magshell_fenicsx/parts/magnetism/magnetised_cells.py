@@ -261,7 +261,7 @@ class SurfaceJets:
 
     @property
     def _incompressible(self) -> Array | float:
-        """`MagnetisedShell.incompressible` of these cells."""
+        """1 in these cells (n, 1) if they keep their volume, else 0; or one number for all."""
         incompressible = self.shape.incompressible
         return np.asarray(incompressible)[self.cells] if np.ndim(incompressible) else incompressible
 
@@ -290,7 +290,8 @@ class SurfaceJets:
         area_vector = np.cross(self.r[1], self.r[2])
         area = np.linalg.norm(area_vector, axis=-1, keepdims=True)
         n = area_vector / area
-        # n = m/|m| with m = r_a x r_b; the thickness of incompressible cells is over |m| as well
+        # with the area vector m = r_a x r_b the normal is m/|m|: the part of `by_normal` along n is
+        # subtracted. The height of incompressible cells is over |m| as well: it is subtracted twice
         normal_factor = 1 + np.asarray(self._incompressible)[..., None]
         along_normal = np.sum(by_normal * n, axis=-1, keepdims=True)
         by_area_vector = (by_normal - normal_factor * along_normal * n) / area
@@ -316,10 +317,9 @@ class SurfaceJets:
             for derivatives in (by_jets, by_B)
         )
         full_turn = 2 * np.pi
-        # a place f = (U, 0, W) has the derivative (0, U, 0) around the axis, times the full turn
-        by_meridian = np.stack([by_jets[0], by_jets[1]])[
-            ..., [0, 2]
-        ]  # by U and W, and their slopes
+        # a place (U, 0, W) has the derivative (0, U, 0) around the axis, times the full turn: to
+        # the derivatives by U and W, and by their slopes, it adds one by U
+        by_meridian = np.stack([by_jets[0], by_jets[1]])[..., [0, 2]]
         by_meridian[0][..., 0] += full_turn * by_jets[2][..., 1]
         by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:2], by_meridian)
         # a remanence (B1, B2, B3) has the derivative (-B2, B1, 0) around the axis
@@ -353,7 +353,10 @@ class SurfaceJets:
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
 
         def rate(**jets: Any) -> Array:
-            """Return the number's derivative (n, m) along an imaginary change of jets."""
+            """Return the number's derivative (n, m) along an imaginary change of jets.
+
+            `jets` are the changed fields r0 or t; all others stay.
+            """
             change = charges_of(replace(self, **jets)).imag
             total = np.sum(by_charges * change, axis=-1)
             return np.asarray(total / COMPLEX_STEP, dtype=np.float64)
@@ -366,6 +369,7 @@ class SurfaceJets:
             t = self.t.astype(np.complex128)
             t[d] += COMPLEX_STEP * 1j
             by_t[d] = rate(t=t)
+        # from jets to nodal values, by the transposed shape functions
         np.add.at(
             nodal_derivatives.by_place,
             self.cells,

@@ -113,12 +113,13 @@ class FieldAtPlaces:
         ]
         if len(factor_names) == 2:
             return self._factor(*factor_names) * self.B
-        if factor_names:
-            return self._factor(*factor_names) * self._motion_rate(motion_names[0])[0]
-        # two motions, or one twice; C = dB/dmu_i is the rate by the one that is carried out first
+        # C = dB/dmu_i is the rate by the motion, of two motions by the one that is carried out
+        # first; with its gradient
         C, slope = self._motion_rate(motion_names[0])
-        # the other motion, with the velocity w = A x + v, changes C like any field, see
-        # `_motion_rate`: dC/dmu_j = A C - (grad C) w
+        if factor_names:
+            return self._factor(*factor_names) * C
+        # the other motion, or the same once more, has the velocity w = A x + v and carries C along
+        # as any field: dC/dmu_j = A C - (grad C) w
         A, v = self._velocity(motion_names[-1])
         w = self.x @ A.T + v
         rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, w)
@@ -141,7 +142,10 @@ class FieldAtPlaces:
         )
 
     def _motion_rate(self, name: str) -> tuple[Array, Array]:
-        """Return dB/dmu (n, 3) by a motion, and its gradient (n, 3, 3), without the factors."""
+        """Return dB/dmu (n, 3) by a motion, and its gradient (n, 3, 3), without the factors.
+
+        With the velocity w = A x + v of the motion it is A B - G w.
+        """
         A, v = self._velocity(name)
         w = self.x @ A.T + v
         C = self.B @ A.T - np.einsum("nij,nj->ni", self.G, w)
@@ -163,7 +167,7 @@ class FieldAtPlaces:
         # the matrix of the cross product: A x = turn x x
         A = np.asarray(np.cross(np.eye(3), motion.turn), dtype=np.float64)
         v = motion.shift - A @ motion.centre
-        # later motions x -> Q x + t carry it to Q A Q^T x + Q v - Q A Q^T t
+        # later motions x -> Q x + t carry the velocity to Q A Q^T x + Q v - Q A Q^T t
         Q, t = combined_motion(motions[motion_number + 1 :], self.mu)
         A = Q @ A @ Q.T
         return A, np.asarray(Q @ v - A @ t)

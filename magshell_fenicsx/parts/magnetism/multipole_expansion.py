@@ -107,6 +107,8 @@ class MultipoleExpansion:
         Middle of the box of each charge, and the charges, in that order.
     _octants
         For each level, matrices that move moments to the larger box, and the boxes they serve.
+    _tree, _kinds, _pairs
+        The parameters.
     """
 
     def __init__(
@@ -117,7 +119,7 @@ class MultipoleExpansion:
         self._own_rows = [
             (cells >= own_cells.start) & (cells < own_cells.stop) for cells, _ in kinds
         ]
-        # box of each charge; `points.q[0].size` is the number of charges of an element
+        # box of each charge, that of its cell; `points.q[0].size` charges belong to an element
         box = np.concatenate(
             [self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds]
         )
@@ -133,6 +135,7 @@ class MultipoleExpansion:
         surfaces = [
             SurfacePoints.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
         ]
+        # thickness times heights over the thickness
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
         x = []  # places of the charges of each kind
         for surface, heights_of_kind in zip(surfaces, heights, strict=True):
@@ -148,6 +151,7 @@ class MultipoleExpansion:
         second ones if `with_second_derivatives`: only their part at one point, L . d2M/du2. See
         `Points.sums` for the sums at points.
         """
+        # rows of the charges of all kinds: potential, and its first and perhaps second derivatives
         values = self._values_at_charges(charges, with_second_derivatives=with_second_derivatives)
         energy, start = 0.0, 0
         for (_, points), all_heights, own_rows in zip(
@@ -177,6 +181,7 @@ class MultipoleExpansion:
         second ones in the order of `SECOND_DERIVATIVES`. Rows are the charges of all kinds, one
         kind after the other.
         """
+        # local expansions (boxes, COUNT), of which the matrices N give those of derivatives
         N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
         matrices = [*N]
         if with_second_derivatives:
@@ -219,28 +224,22 @@ class MultipoleExpansion:
         weights
             Factors of the energy and of its rate.
         """
-        Y, N, width = self.place_charges(nodes).Y, derivatives(), self._leaf.width
+        Y, width = self.place_charges(nodes).Y, self._leaf.width
+        # of each kind: mid-surface places, normals and places x of the charges, complex
         places_of_kinds = [
             places(points, np.arange(len(points.q)), moved_nodes[cells]) for cells, points in kinds
         ]
-
-        def directional_derivatives(v: NDArray[np.floating[Any]], Y: Array) -> Array:
-            """Return the derivatives of harmonics Y along v (charges, 3), over the box's width."""
-            return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
-
-        rate = (
-            np.concatenate([x.reshape(-1, 3) for _, _, x in places_of_kinds])[self._order].imag
-            / COMPLEX_STEP
-            / width
-        )
-        dY = directional_derivatives(rate, Y)
+        # rates of the charges in the order of boxes, and of their harmonics
+        x_of_charges = np.concatenate([x.reshape(-1, 3) for _, _, x in places_of_kinds])
+        rate = x_of_charges[self._order].imag / COMPLEX_STEP / width
+        dY = _directional_derivatives(rate, Y)
+        # local expansions of the potential, and of its rate due to the distant charges
         L, dL = (
-            self.local_expansions(self._moments(self._q * factor_harmonics))[..., 0]
-            for factor_harmonics in (Y, dY)
+            self.local_expansions(self._moments(self._q * harmonics_or_rates))[..., 0]
+            for harmonics_or_rates in (Y, dY)
         )
-        # factor, harmonics and their rates for derivatives by charges, then by heights: a height
-        # moves a charge q along the normal
-        factors_and_rates: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
+        by_variables = [self._from_expansions((L, dL), (Y, dY), weights)]
+        # a height moves a charge q along the normal: the derivative by it is q times that of Y
         if heights:
             normals = [
                 np.broadcast_to(n[..., None, :], x.shape).reshape(-1, 3)
@@ -248,35 +247,55 @@ class MultipoleExpansion:
             ]
             upwards = np.concatenate(normals)[self._order] / width
             n, dn = upwards.real, upwards.imag / COMPLEX_STEP
-            nY = directional_derivatives(n, Y)
-            factors_and_rates.append(
-                (
-                    self._q,
-                    nY,
-                    np.asarray(directional_derivatives(rate, nY) + directional_derivatives(dn, Y)),
-                )
-            )
+            nY = _directional_derivatives(n, Y)
+            dnY = np.asarray(_directional_derivatives(rate, nY) + _directional_derivatives(dn, Y))
+            by_heights = self._from_expansions((L, dL), (nY, dnY), weights)
+            by_heights[self._order] *= self._q
+            by_variables.append(by_heights)
+        # for each kind its derivatives by charges, and perhaps by heights
+        by_kinds = [self._split_by_kind(by_variable, kinds) for by_variable in by_variables]
+        return [list(of_kind) for of_kind in zip(*by_kinds, strict=True)]
+
+    def _split_by_kind(
+        self, by_charges: Array, kinds: Sequence[tuple[Ints, Points]]
+    ) -> list[Array]:
+        """Return derivatives by all charges as one array (rows, P, L) for each kind.
+
+        Elements of cells of other ranks get zero.
+        """
         split = np.cumsum([points.q.size for _, points in kinds])[:-1]
-        derivatives_by_kind = list[list[Array]]()
-        for factor, factor_harmonics, rates in factors_and_rates:
-            by_charges = np.empty(len(self._q))
-            for box, first, last in zip(
-                self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
-            ):
-                y, dy = factor_harmonics[:, first:last], rates[:, first:last]
-                by_moments = weights.energy * (L[box] @ y) + weights.force * (
-                    L[box] @ dy + dL[box] @ y
-                )
-                by_charges[self._order[first:last]] = by_moments / width
-            by_charges[self._order] *= factor
-            split_by_kind = zip(np.split(by_charges, split), kinds, self._own_rows, strict=True)
-            derivatives_by_kind.append(
-                [
-                    derivatives_of_kind.reshape(points.q.shape) * own_rows[:, None, None]
-                    for derivatives_of_kind, (_, points), own_rows in split_by_kind
-                ]
-            )
-        return [list(split_by_kind) for split_by_kind in zip(*derivatives_by_kind, strict=True)]
+        parts = zip(np.split(by_charges, split), kinds, self._own_rows, strict=True)
+        return [
+            of_kind.reshape(points.q.shape) * own_rows[:, None, None]
+            for of_kind, (_, points), own_rows in parts
+        ]
+
+    def _from_expansions(
+        self, expansions: tuple[Array, Array], harmonics: tuple[Array, Array], weights: Weights
+    ) -> Array:
+        """Return `weights.energy` times Y . L plus `weights.force` times its rate, at charges.
+
+        Parameters
+        ----------
+        expansions
+            (boxes, COUNT) local expansions L, and their rates.
+        harmonics
+            (COUNT, charges) harmonics Y in the order of boxes, and their rates.
+
+        Returns
+        -------
+        Array
+            (charges,) in the order of kinds, with the width divided out.
+        """
+        (L, dL), (Y, dY) = expansions, harmonics
+        values = np.empty(len(self._q))
+        for box, first, last in zip(
+            self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
+        ):
+            y, dy = Y[:, first:last], dY[:, first:last]
+            by_moments = weights.energy * (L[box] @ y) + weights.force * (L[box] @ dy + dL[box] @ y)
+            values[self._order[first:last]] = by_moments / self._leaf.width
+        return values
 
     def _moments(self, values: Array) -> Array:
         """Return moments (boxes, COUNT, 1), the sums over each box of values (COUNT, charges).
@@ -339,7 +358,8 @@ class MultipoleExpansion:
         The moments are those of the cell's charges about the middle of the cell's box. A charge
         moves with its mid-surface place, and at a height with the normal too.
         """
-        N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
+        _, points_of_first_kind = self._kinds[0]
+        N, start, k = derivatives(), 0, points_of_first_kind.tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
         slopes = np.empty((3, len(self._q), COUNT))
         # derivatives of moments by the places of charges, in the order of kinds again
@@ -352,6 +372,7 @@ class MultipoleExpansion:
             stop, T = start + points.q.size, points.tables
             slopes_of_kind = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT)
             start = stop
+            # by the places of the mid-surface: the sum over the layers of each point
             B[cells] += np.einsum(
                 "pk,irpa->raki", T[:, 0], slopes_of_kind.sum(axis=3), optimize=True
             )
@@ -365,6 +386,15 @@ class MultipoleExpansion:
                     "pk,rpi,rpa->raki", T[:, 1 + d], surface.n, moments_by_tangent, optimize=True
                 )
         return B.reshape(len(B), COUNT, 3 * k)
+
+
+def _directional_derivatives(v: NDArray[np.floating[Any]], Y: Array) -> Array:
+    """Return the derivatives (COUNT, charges) of harmonics Y along v (charges, 3).
+
+    Harmonics take lengths over the width of the box, and so must v.
+    """
+    N = derivatives()
+    return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
 
 @dataclass(frozen=True)
@@ -398,6 +428,7 @@ class CellNodes:
         the modelled part itself, has no sign.
         """
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
+        # (3, nodes, n) of each copy, with the factor `sign` for all but the first
         changes = [
             sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)
         ]
@@ -428,13 +459,13 @@ class InteractionHessian:
     far
         Multipole expansion of all others.
     B
-        See `MultipoleExpansion.jacobian`.
+        (cells, COUNT, 3 k) derivatives of the multipole moments of a cell's charges by its nodes.
     scale
         Factor of the far part.
     cells
         Numbers of nodes.
     sign
-        -1 of additions to u that are opposite in the images.
+        1 if additions to u move the images as mirror images, -1 if they move them oppositely.
     is_adjacent
         Which of the stored blocks are of nodes of cells in boxes that touch.
     block_rotation
@@ -475,12 +506,13 @@ class InteractionHessian:
         The rows (3 local nodes, n) are those of this rank's cells; v has all nodes.
         """
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
-        # dM = B du, then L = G dM, then forces B^T L
-        of_cell, local_expansions = self.far.local_expansions_of_cells(
-            _cellwise_products(self.B, self.cells.changes_of_copies(v, self.sign))
-        )
+        # changes of the nodes of all cells, and of their moments: dM = B du
+        changes = self.cells.changes_of_copies(v, self.sign)
+        changes_of_moments = _cellwise_products(self.B, changes)
+        # the box of each cell, and local expansions of boxes: L = G dM; then forces B^T L
+        box_of_cell, local_expansions = self.far.local_expansions_of_cells(changes_of_moments)
         forces_on_cells = _cellwise_products(
-            self.B[own_cells].transpose(0, 2, 1), local_expansions[of_cell[own_cells]]
+            self.B[own_cells].transpose(0, 2, 1), local_expansions[box_of_cell[own_cells]]
         )
         return self.scale * self.cells.sum_at_nodes(forces_on_cells)
 

@@ -46,6 +46,8 @@ def harmonics(x: Array) -> Array:
         for degree in range(m + 1, ORDER + 1):
             # recurrence in the degree l at fixed m
             inverse_product = 1 / ((degree + m) * (degree - m))
+            # rows of the real part, and of the imaginary part for m > 0, of this degree and of the
+            # two lower ones
             for imaginary in range(1 + (m > 0)):
                 row, lower, second_lower = (place_of(degree - k, m) + imaginary for k in range(3))
                 np.multiply(z, Y[lower], out=Y[row])
@@ -127,7 +129,7 @@ def translations(D: Array) -> Array:
     # from Y to the conjugates of all R_l^m, as matrix C; keys are (l, m)
     rows, _ = _complex()
     C, keys = np.array(list(rows.values())).conj(), list(rows)
-    # the sum of the module's head over the harmonics of a and of b
+    # the sum over the harmonics of a and of b: (-1)^l conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')
     G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
     for i, (degree_of_a, m_of_a) in enumerate(keys):
         for j, (degree_of_b, m_of_b) in enumerate(keys):

@@ -67,7 +67,8 @@ class Copies:
     Attributes
     ----------
     images
-        Images under mirrors and rotations; the first is the modelled part itself.
+        Images under mirrors and rotations; the first is the modelled part itself. An image has a
+        `sign`, 1 or -1, which is negative if it is mirrored.
     charge_sign
         1 if charges of mirrored images equal the modelled ones, -1 if they are opposite.
     """
@@ -130,7 +131,8 @@ class Points:
 class Stiffness:
     """Blocks (3, 3) of a matrix between nodes, to which second derivatives are added.
 
-    Second derivatives by the nodes of one cell are first summed for each cell: see `finish`.
+    Second derivatives by two nodes of one cell are first summed for each cell, in `onto`; the
+    method `finish` adds these sums to the blocks.
 
     Parameters
     ----------
@@ -153,7 +155,8 @@ class Stiffness:
     starts, columns
         First block of each row, and the column of each block.
     onto
-        (cells, k (k + 1)/2, 3, 3) sums of each cell, upper triangle of its nodes.
+        (cells, k (k + 1)/2, 3, 3) sums of second derivatives by two nodes of the same cell, for
+        each pair of its nodes in the upper triangle.
     _count
         Number of blocks of the pattern, without those of images.
     """
@@ -187,7 +190,7 @@ class Stiffness:
         # own modelled cells; rows of all others are -1
         for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
             sums = self.factor * self.onto[cell]
-            # both triangles of the symmetric matrix of its nodes
+            # both triangles of the symmetric matrix (k, k, 3, 3) of its nodes
             blocks_of_cell[b, a] = sums.transpose(0, 2, 1)
             blocks_of_cell[a, b] = sums
             rows, columns = self.row_of[cell], self.column_of[cell]
@@ -268,17 +271,19 @@ class Pairs:
         """
         if not len(cells):
             return 0.0
+        (left_points, left_rows), (right_points, right_rows) = left, right
         # to a multiple of `LANES`, with the last pair, whose repetitions C leaves out
         padding = -len(cells) % LANES
-        filled_cells, left_rows, right_rows = (
-            _filled(rows, padding) for rows in (cells, left[1], right[1])
+        filled_cells, filled_left, filled_right = (
+            _filled(rows, padding) for rows in (cells, left_rows, right_rows)
         )
         # whether the second cell has the same points for all points of the first one
-        is_shared = right[0].tables.ndim == 3
+        is_shared = right_points.tables.ndim == 3
         p = self._pointer
-        right_sums = p(right[0].sums) if is_shared else self._ffi.NULL
-        left_arguments = [*self._point_arguments(left[0]), p(left[0].sums), p(left_rows)]
-        right_arguments = [*self._point_arguments(right[0]), right_sums, p(right_rows)]
+        right_sums = p(right_points.sums) if is_shared else self._ffi.NULL
+        # arguments in the order of `pairs` in C
+        left_arguments = [*self._point_arguments(left_points), p(left_points.sums), p(filled_left)]
+        right_arguments = [*self._point_arguments(right_points), right_sums, p(filled_right)]
         pair_arguments = [len(filled_cells), counted, padding, p(filled_cells)]
         return float(
             self._lib.pairs(
@@ -339,8 +344,15 @@ class Pairs:
     ) -> float:
         """Return the energy of pairs (n, 2) of cells with stacked faces, and add derivatives.
 
-        The energy is nan if two cells overlap. See `add` for `gradient` and `stiffness`, and
-        `cells` for `struct`.
+        The energy is nan if two cells overlap.
+
+        Parameters
+        ----------
+        struct
+            The result of the method `cells`: the charges and rules of the cells, for C.
+        gradient, stiffness
+            (cells, k, 3) and a matrix, to which first and second derivatives by nodes are added;
+            None for no second ones.
         """
         if not len(cells):
             return 0.0
@@ -355,6 +367,15 @@ class Pairs:
         """Return the rule on the second cell as seen from each of P points of the first cell.
 
         None if both cells overlap.
+
+        Parameters
+        ----------
+        struct
+            The result of the method `cells`: the charges and rules of the cells, for C.
+        first, second
+            Numbers of the cells.
+        max_points
+            Largest number of points of a rule.
 
         Returns
         -------
@@ -389,7 +410,7 @@ class Pairs:
 
         `cells` (rows,) are the cells of the points; `gradient` is (cells, k, 3).
         """
-        padding, p = -len(cells) % LANES, self._pointer
+        padding, p = -len(cells) % LANES, self._pointer  # to a multiple of `LANES`
         filled, (P, *_) = _filled(cells, padding), points.tables.shape
         cell_blocks = p(stiffness.onto) if stiffness else self._ffi.NULL
         size_arguments = [len(filled), padding, p(filled), nodes.shape[1], p(nodes), P]

@@ -156,7 +156,7 @@ class SensorsObservables(Observables):
         if not loads.sensors or surface.nodes.shape[1] < 3:
             return
         corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
-        # 45 places on each flat triangle
+        # 45 places on each flat triangle, by barycentric coordinates in steps of 1/8
         barycentric = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
         surface_points = cKDTree(np.einsum("mk,nki->nmi", barycentric, corners).reshape(-1, 3))
         for sensor in loads.sensors:
@@ -199,7 +199,8 @@ class SensorsObservables(Observables):
         ]
         if not sensors_and_components:
             return None
-        (sensor, i), self_field_of_model = sensors_and_components[0], self_field(view)
+        (sensor, i), *_ = sensors_and_components
+        self_field_of_model = self_field(view)
         # e_i of the case in the model's frame, times the unit: the column is direction . B
         direction = sensor.own * rotation(view.azimuth)[:, i]
         system = view.model.system
@@ -207,19 +208,24 @@ class SensorsObservables(Observables):
 
         def nodal_derivatives() -> tuple[Array, Array]:
             """Return derivatives by u, summed at nodes, and by the remanence in cells."""
-            derivatives, by_u = (
-                self_field_of_model.derivatives(state.mu, sensor.place, direction),
-                np.zeros_like(system.u.x.array),
-            )
+            # by the values at the nodes of each cell
+            derivatives = self_field_of_model.derivatives(state.mu, sensor.place, direction)
+            by_u = np.zeros_like(system.u.x.array)
             components = derivatives.by_u.shape[2]
             own_nodes = nodes[: len(derivatives.by_u)]
             np.add.at(by_u.reshape(-1, components), own_nodes, derivatives.by_u)
             return by_u, derivatives.by_remanence
 
         by_u, by_remanence = at_state.evaluate(nodal_derivatives)
-        by_mu = self._derivatives_by_field(view, state, sensor, i)
-        value = float(self._readings(view, state, [sensor])[0][i])
-        return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
+        by_mu = self._derivatives_by_field(view, state, sensor, component=i)
+        (reading,) = self._readings(view, state, [sensor])  # (3,)
+        return Slope(
+            value=float(reading[i]),
+            by_u=at_state.summed(by_u),
+            by_mu=by_mu,
+            field=self_field_of_model.Br,
+            by_field=by_remanence,
+        )
 
     def _derivatives_by_field(
         self, view: ModelView, state: "State", sensor: Sensor, component: int
@@ -242,10 +248,11 @@ class SensorsObservables(Observables):
         for name in sorted(names & state.mu.keys()):
             value = state.mu[name]
             step = DIFFERENCE_STEP * (abs(value) or 1.0)
-            readings = dict[int, float]()  # by the number of steps
+            readings = dict[int, float]()  # number of steps by which mu is moved -> reading
             for steps, _ in DIFFERENCE_WEIGHTS:
                 moved_state = State(state.u, {**state.mu, name: value + steps * step})
-                readings[steps] = self._readings(view, moved_state, [sensor])[0][component]
+                (reading,) = self._readings(view, moved_state, [sensor])  # (3,)
+                readings[steps] = reading[component]
             by_mu[name] = float(
                 sum(weight / step * readings[steps] for steps, weight in DIFFERENCE_WEIGHTS)
             )
@@ -297,6 +304,7 @@ def field_at(
         view.model.system.at_state(state).evaluate(own_field_there),
         view.loads.magnetic,
     )
+    # the applied field is read where its factor is not zero
     if applied_field and np.any(applied_factor):
         B = B + applied_factor * applied_field.field_at(state.mu, places)
     return np.asarray(B @ rotation(view.azimuth))

@@ -64,9 +64,9 @@ class RemanentSection(FileKeys, Direction):
     def _keys_of_the_kind(self) -> Self:
         """Refuse keys that do not belong to the kind, or are missing for it, with a ValueError."""
         # key -> the kind that needs it, and alone may have it
-        belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
-        belongs |= {"file": "points", "filter": "points"}
-        for key, kind in belongs.items():
+        kind_of_key = {"components": "expression", "patches": "patches", "layers": "layers"}
+        kind_of_key |= {"file": "points", "filter": "points"}
+        for key, kind in kind_of_key.items():
             if (getattr(self, key) is not None) != (self.kind == kind):
                 raise ValueError(
                     f"{key} belongs to kind: {kind}, and must be given there; the kind is "

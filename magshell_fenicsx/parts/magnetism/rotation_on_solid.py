@@ -41,9 +41,11 @@ def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> 
 def rotated(F: Expr, v: Expr) -> Expr:
     """Return R v, with the rotation R of the polar decomposition F = R U.
 
-    Cayley and Hamilton's theorem gives R without a decomposition; see the module.
+    It is v multiplied by (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), with C = F^T F and the
+    invariants i1, i2, i3 of U (the theorem of Cayley and Hamilton).
     """
-    # invariants of C: I = F:F, II = cof F : cof F; i1, i2, i3 are those of U
+    # cof F from the columns of F; `first` and `second` are the invariants tr C = F:F and
+    # tr cof C = cof F : cof F
     f1, f2, f3 = (F[:, i] for i in range(3))
     cofactor = ufl.as_tensor([ufl.cross(f2, f3), ufl.cross(f3, f1), ufl.cross(f1, f2)]).T
     first, second, i3 = (

@@ -75,11 +75,9 @@ def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
 
     Below `SERIES_LIMIT` they are derivatives of the series, above closed forms.
     """
-    y_below, y_above, is_below = (
-        np.minimum(y, SERIES_LIMIT),
-        np.maximum(y, SERIES_LIMIT),
-        y < SERIES_LIMIT,
-    )
+    is_below = y < SERIES_LIMIT
+    # both branches are computed everywhere; the limit keeps each of them finite
+    y_below, y_above = np.minimum(y, SERIES_LIMIT), np.maximum(y, SERIES_LIMIT)
     x = np.sqrt(y_above)
     c, inverse = 1 / np.tanh(x), 4 * np.exp(-2 * x) / np.expm1(-2 * x) ** 2  # coth x and 1/sinh² x
     first = (1.5 * (c / x - inverse) - k) / y_above
@@ -137,7 +135,10 @@ def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) ->
     `chi` is the susceptibility, `n` (..., 3) are the normals, `J` is the saturation.
     """
     s = np.sum(along * along, axis=-1, keepdims=True)
-    kappa = chi * ratio((3 * chi / J) ** 2 * (s + normal_field(chi, normal**2, s, J) ** 2))
+    b_n = normal_field(chi, normal**2, s, J)
+    # y = x² of Langevin's argument x = 3 chi |b|/J; kappa = chi k
+    y = (3 * chi / J) ** 2 * (s + b_n**2)
+    kappa = chi * ratio(y)
     return np.asarray(kappa * (along + normal / (1 + kappa) * n))
 
 
@@ -147,13 +148,13 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
     It is Taylor's polynomial of third order about p = B_n² and s = |B_t|², in the order of
     `ORDERS`; `energy` evaluates it. `chi` is the susceptibility, `J` the saturation.
     """
-    # suffixes _s and _p are derivatives by these; k1, k2, T1 and T2 are first and second ones by y.
-    # kappa = chi k is the susceptibility at this field.
+    # suffixes _s and _p are derivatives by s and p, as in y_s; k1, k2, T1 and T2 are the first and
+    # second derivatives of k and T by y. b is |b_n|
     b, scale = normal_field(chi, p, s, J), (3 * chi / J) ** 2
     y = scale * (s + b**2)
     k = ratio(y)
     k1, k2 = slopes_of_ratio(y, k)
-    # T(y) = 1/(1 + kappa)², with b_n² = p T
+    # b_n² = p T with T(y) = 1/(1 + kappa)² = q², where kappa = chi k
     q = 1 / (1 + chi * k)
     T, T1, T2 = q**2, -2 * chi * k1 * q**3, -2 * chi * k2 * q**3 + 6 * (chi * k1) ** 2 * q**4
     # derivatives of y follow from y = scale (s + p T(y))
@@ -162,7 +163,7 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
     D_s, D_p = -scale * p * T2 * y_s, -scale * (T1 + p * T2 * y_p)
     y_ss, y_ps = -y_s * D_s / D, -y_s * D_p / D
     y_pp = scale * T1 * y_p / D - y_p * D_p / D
-    # from e_p = -kappa/(1 + kappa)/2 and e_s = -kappa/2
+    # derivatives of e by p and s, (i, j) times: from e_p = -kappa/(1 + kappa)/2 and e_s = -kappa/2
     half = -chi / 2
     derivatives = {
         (0, 0): half * (s + b**2) * coenergy(y) - (np.sqrt(p) - b) ** 2 / 2,
@@ -182,7 +183,8 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
     """Return the energy e(p, s) from the polynomial P (`SIZE`,); see `expand_energy`."""
-    # about the field of the last update; coefficients follow in the order of `ORDERS`
+    # the first two entries are p and s about which it is expanded; coefficients follow in the order
+    # of `ORDERS`
     dp, ds = p - P[0], s - P[1]
     return sum(P[2 + number] * dp**i * ds**j for number, (i, j) in enumerate(ORDERS))
 

@@ -12,7 +12,7 @@ and their copies by mirrors and rotations, which together make the whole shell; 
 have opposite charges. A jet is a field with its derivatives by reference coordinates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.mirror import Image, rotation
+from magshell_fenicsx.mesh.mirror import Image, Mirror, rotation
 from magshell_fenicsx.models.shell.spatial_fields import (
     Uniform,
     pattern_field,
@@ -86,6 +86,11 @@ class SelfField:
         Element of a remanence that is not convected.
     _owned, _dim
         Number of this rank's cells, and their dimension: 1 on a meridian.
+    _model
+        The model of the view.
+    _image_sign
+        1 if mirror images continue the remanence, -1 if their opposites do, 0 if no remanence
+        decides it.
     """
 
     def __init__(self, view: ModelView) -> None:
@@ -173,10 +178,10 @@ class SelfField:
 
         `x` (3,) is a place over R and `e` (3,) a direction.
         """
-        derivatives_of_families = list[NodalDerivatives]()
         # Uncharged elements have derivatives by the remanence, too. A convected remanence takes two
         # runs: derivatives by u come from the first, without these elements, and those by the
-        # remanence from the second.
+        # remanence from the second. Otherwise one run with all elements gives both.
+        derivatives_of_runs = list[NodalDerivatives]()
         for include_uncharged in (False, True) if self._is_convected else (True,):
             shape, families = self.families(mu, include_uncharged=include_uncharged)
             nodal_derivatives = NodalDerivatives(
@@ -186,10 +191,13 @@ class SelfField:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
                 # place and direction are taken back to the modelled cells
                 gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, nodal_derivatives)
-            derivatives_of_families.append(nodal_derivatives)
-        first, last = derivatives_of_families[0], derivatives_of_families[-1]
+            derivatives_of_runs.append(nodal_derivatives)
+        first, last = derivatives_of_runs[0], derivatives_of_runs[-1]
         nodal_derivatives = NodalDerivatives(first.by_u, last.by_remanence)
-        return nodal_derivatives if self._is_convected else self._to_material(nodal_derivatives, mu)
+        if self._is_convected:
+            return nodal_derivatives
+        # so far the remanence of the charges is F^-1 J, which depends on u and Br
+        return self._to_material(nodal_derivatives, mu)
 
     def moment(self, mu: Mapping[str, float]) -> Array:
         """Return the magnetic moment, remanent and induced, (3,) over R³; collective."""
@@ -200,7 +208,8 @@ class SelfField:
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
         """Return the moment of this rank's modelled cells."""
-        return moment(self.families(mu)[1])
+        _, families = self.families(mu)
+        return moment(families)
 
     @property
     def _images(self) -> list[Image]:
@@ -225,24 +234,24 @@ class SelfField:
         if self._is_convected:
             remanence_element = self.Br.function_space.element.basix_element
             remanence = self._nodal_remanence()
-        else:
+        else:  # F^-1 J at the present displacement
             remanence_element = self._interpolation
             remanence = self._material(self._jets(r0), self._jets(u), mu)
         return MagnetisedShell(
-            V.element.basix_element,
-            r0,
-            u,
-            remanence_element,
-            remanence,
-            model.material.h,
-            thickness_factor,
+            element=V.element.basix_element,
+            r0=r0,
+            u=u,
+            remanence_element=remanence_element,
+            remanence=remanence,
+            h=model.material.h,
+            thickness_factor=thickness_factor,
             swept=components == 2,  # a meridian, with (U, W)
             incompressible=self._incompressible,
         )
 
     @property
     def _incompressible(self) -> Array | float:
-        """`MagnetisedShell.incompressible` of this rank's cells."""
+        """1 in this rank's cells (cells, 1) that keep their volume, else 0; or one for all."""
         thins = self._model.law_of_cells.thins
         return np.asarray(thins)[: self._owned] if np.ndim(thins) else thins
 
@@ -277,16 +286,16 @@ class SelfField:
         """Return F^-1 J (cells, nodes, 3), J the polarisation per undeformed volume over |Br|.
 
         Charges of this field stay with the material. `r0` and `u` are jets of placement and
-        displacement at the interpolation nodes; see `_jets`.
+        displacement at the interpolation nodes: values and derivatives by reference coordinates.
         """
-        # the frame takes second derivatives too, which are not used here: zeros stand for them
-        frame, magnetisation = (
-            TangentFrame.from_jet(np.concatenate([r0, 0 * r0])),
-            self.magnetisation,
-        )
+        # the undeformed tangents and normals; the frame takes second derivatives too, which are not
+        # used here: zeros stand for them
+        frame = TangentFrame.from_jet(np.concatenate([r0, 0 * r0]))
+        magnetisation = self.magnetisation
         n = frame.normal(u)
         J, soft = np.zeros_like(n), magnetisation.soft
-        # a soft magnet alone has no remanence
+        # the remanence at the interpolation nodes, moved with F or rotated; a soft magnet alone has
+        # none
         if not (soft and soft.alone):
             space_of_Br = self.Br.function_space
             tables = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)
@@ -297,9 +306,9 @@ class SelfField:
                 if magnetisation.law == "deformation"
                 else frame.rotated(Br, u)
             )
+        # what the applied field induces; scale² takes it from the unit mu0 E/|Br| of B to |Br|
         if soft:
             B = magnetisation.field_at(mu, r0[0] + u[0])
-            # scale²: from the unit mu0 E/|Br| of B to |Br|
             J = J + soft.scale**2 * soft.polarisation(r0[0], frame.n0, n, B)
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
         area_vector = np.cross(r1, r2)
@@ -323,8 +332,16 @@ class SelfField:
     ) -> NodalDerivatives:
         """Return derivatives by displacement and remanence, from those by F^-1 J.
 
-        See `_material` for F^-1 J. The chain rule takes central differences of fourth order by u.
-        F^-1 J is affine in the remanence, so that a step of one is exact.
+        F^-1 J is the polarisation that stays with the material. It depends on the displacement,
+        by which the chain rule takes central differences of fourth order. It is affine in the
+        remanence, so that a difference with a step of one is exact.
+
+        Parameters
+        ----------
+        nodal_derivatives
+            Derivatives by u at fixed F^-1 J, and `by_remanence` those by F^-1 J.
+        mu
+            Amplitudes of the applied field.
         """
         V, model = self._model.r0.function_space, self._model
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
@@ -337,14 +354,7 @@ class SelfField:
             material = self._material(r0, u_jets, mu)
             return np.asarray(np.sum(nodal_derivatives.by_remanence * material, axis=-1))
 
-        # by the value (d = 0) and the derivatives of u at interpolation nodes, component i
-        by_jets = np.zeros_like(u)
-        for d in range(len(u)):
-            for i in range(3):
-                for steps, weight in DIFFERENCE_WEIGHTS:
-                    u_moved = u.copy()
-                    u_moved[d, ..., i] += steps * DIFFERENCE_STEP
-                    by_jets[d, ..., i] += weight / DIFFERENCE_STEP * result_at(u_moved)
+        by_jets = _differences_by_jets(result_at, u)
         # brought to the nodes of u by the transposed shape functions
         T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
         # on a meridian du/dtheta = U e_theta: its component adds to that of U; see `_jets`
@@ -353,19 +363,26 @@ class SelfField:
             by_meridian[0][..., 0] += by_jets[2][..., 1]
             by_jets = by_meridian
         by_u = nodal_derivatives.by_u + np.einsum("dmk,dnmi->nki", T, by_jets)
-        space_of_Br = self.Br.function_space
+        return NodalDerivatives(by_u, self._changes_by_remanence(lambda: result_at(u)))
+
+    def _changes_by_remanence(self, result: Callable[[], Array]) -> Array:
+        """Return the changes (cells, nodes, 3) of a sum for one more in each component of Br.
+
+        The sum is that of `result` (cells, interpolation nodes) for the present Br. Br is changed
+        for a moment, and then set back.
+        """
         # tables of Br's shape functions, transposed below: from interpolation nodes to nodes of Br
+        space_of_Br = self.Br.function_space
         TB = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)[0, :, :, 0]
-        # by the remanence: the change of the result for one more in each component of Br
         present_Br, by_Br = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
             self.Br.x.array[:] = present_Br
-            value_before = result_at(u)
+            value_before = result()
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
-            change = result_at(u) - value_before
+            change = result() - value_before
             by_Br[..., i] = np.einsum("mk,nm->nk", TB, change)
         self.Br.x.array[:] = present_Br
-        return NodalDerivatives(by_u, by_Br)
+        return by_Br
 
     def _charged_sides(
         self, *, include_all: bool = False
@@ -385,8 +402,11 @@ class SelfField:
             topology.connectivity(dim - 1, dim),
             topology.connectivity(dim, dim - 1),
         )
+        # numbers of the facets (edges, or ends on a meridian) of each cell, and how many cells each
+        # facet has
         facets_of_cells = to_facets.array.reshape(-1, dim + 1)
-        cell_counts = np.diff(to_cells.offsets)  # of each facet
+        cell_counts = np.diff(to_cells.offsets)
+        # the remanence of all cells, ghosts included, at nodes and in the middles of edges
         nodal_remanence = self._nodal_remanence(len(facets_of_cells))
         largest = np.abs(nodal_remanence).max(initial=0.0) or 1.0
         at_edges = self._remanence_at_edges(len(facets_of_cells), nodal_remanence)
@@ -394,11 +414,13 @@ class SelfField:
         all_are_charged = include_all or not self._is_convected
 
         def is_charged(cell: int, local_edge: int) -> bool:
+            """Return whether an edge of a cell is charged."""
             facet = facets_of_cells[cell, local_edge]
             if facet in mirrored_facets:
                 return False
             if cell_counts[facet] == 1 or all_are_charged:  # one cell: at the boundary
                 return True
+            # the cell on the other side, and the number of the edge there
             neighbour = next(int(c) for c in to_cells.links(facet) if c != cell)
             edge_of_neighbour = int(np.flatnonzero(facets_of_cells[neighbour] == facet)[0])
             jump = at_edges[cell, local_edge] - at_edges[neighbour, edge_of_neighbour]
@@ -414,7 +436,7 @@ class SelfField:
         edges = np.array([local_edge for _, local_edge in sides], dtype=np.intp)
         if dim == 2:
             return cells, edges
-        # a pole has no edge
+        # an end of a meridian on the axis is a pole, and no edge
         is_off_axis = np.abs(self._radii_of_ends()[cells, edges]) > AXIS_TOLERANCE
         return cells[is_off_axis], edges[is_off_axis]
 
@@ -467,6 +489,28 @@ class SelfField:
         mirrored_back = pattern(self._sight.mirror.image(x), n @ S) @ S
         product = float(np.sum(mirrored_back * pattern(x, n)))
         return float(np.sign(self._model.system.comm.allreduce(product)))
+
+
+def _differences_by_jets(f: Callable[[Array], Array], u: Array) -> Array:
+    """Return derivatives (d, cells, nodes, 3) of a function by jets of the same shape.
+
+    They are by the value (d = 0) and by the derivatives of u at each node, by central differences.
+
+    Parameters
+    ----------
+    f
+        Function of jets, whose value (cells, nodes) at a node depends on the jets there.
+    u
+        The jets at which derivatives are taken.
+    """
+    by_jets = np.zeros_like(u)
+    for d in range(len(u)):
+        for i in range(3):
+            for steps, weight in DIFFERENCE_WEIGHTS:
+                u_moved = u.copy()
+                u_moved[d, ..., i] += steps * DIFFERENCE_STEP
+                by_jets[d, ..., i] += weight / DIFFERENCE_STEP * f(u_moved)
+    return by_jets
 
 
 def magnetic_moment(view: ModelView, mu: Mapping[str, float]) -> Array:
@@ -523,41 +567,24 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
         raise CaseError(
             "to_magpylib: of a shell with a remanence or a susceptibility, this has neither"
         )
-    module, field_of_model, mirror = magpylib("to_magpylib"), self_field(view), view.mirror
+    module, field_of_model = magpylib("to_magpylib"), self_field(view)
     # from the model's frame, which a mirror plane may have turned, to that of the case; R in metres
     Q, R = rotation(view.azimuth), magnetisation.metres or 1.0
-
-    def charged_triangles() -> list[tuple[Array, Array]]:
-        """Return corners (n, 3, 3) and charges (n,) of this rank's triangles and their images."""
-        _, families = field_of_model.families(state.mu)
-        triangles_and_charges = [
-            chunk
-            for family in field_of_model.surface_charges(families)
-            for chunk in triangles(family, parts)
-        ]
-        if mirror:
-            sign = field_of_model.sign_of_images(state.mu)
-            copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
-            triangles_and_charges = [
-                (image.apply(x), factor * q)
-                for image, factor in copies
-                for x, q in triangles_and_charges
-            ]
-        return triangles_and_charges
-
+    # corners and charges of the triangles of all ranks at the state
     system = view.model.system
-    on_all_ranks = system.comm.allgather(system.at_state(state).evaluate(charged_triangles))
-    triangles_and_charges = [chunk for on_rank in on_all_ranks for chunk in on_rank]
+    on_rank = system.at_state(state).evaluate(
+        lambda: _charged_triangles(field_of_model, view.mirror, state.mu, parts)
+    )
+    on_all_ranks = system.comm.allgather(on_rank)
+    triangles_and_charges = [chunk for chunks in on_all_ranks for chunk in chunks]
     corners, charges = (
         np.concatenate([chunk[i] for chunk in triangles_and_charges]) for i in range(2)
     )
     corners = R * corners @ Q
     area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
-    charges_per_area = (
-        magnetisation.tesla * R**2 * charges / np.sum(area_vectors * area_vectors, axis=-1)
-    )
-    # a polarisation normal to a triangle gives it that charge per area
-    J = charges_per_area[:, None] * area_vectors
+    # a polarisation normal to a triangle gives it a charge per area of its size
+    squared_areas = np.sum(area_vectors * area_vectors, axis=-1)
+    J = (magnetisation.tesla * R**2 * charges / squared_areas)[:, None] * area_vectors
 
     def flux_density(field: str, observers: Array) -> Array:
         """Return B or H, whatever magpylib asks for, of all triangles at observers (n, 3)."""
@@ -571,3 +598,27 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
         return np.asarray(B / MU_0 if field == "H" else B)
 
     return module.misc.CustomSource(field_func=flux_density)
+
+
+def _charged_triangles(
+    field_of_model: SelfField, mirror: Mirror | None, mu: Mapping[str, float], parts: int
+) -> list[tuple[Array, Array]]:
+    """Return corners (n, 3, 3) over R and charges (n,) of this rank's triangles and their images.
+
+    The list has a pair of arrays for each chunk of elements; `parts` is that of `to_magpylib`.
+    """
+    _, families = field_of_model.families(mu)
+    triangles_and_charges = [
+        chunk
+        for family in field_of_model.surface_charges(families)
+        for chunk in triangles(family, parts)
+    ]
+    if mirror:
+        sign = field_of_model.sign_of_images(mu)
+        copies = [(image, sign if image.sign < 0 else 1.0) for image in mirror.images]
+        triangles_and_charges = [
+            (image.apply(x), factor * q)
+            for image, factor in copies
+            for x, q in triangles_and_charges
+        ]
+    return triangles_and_charges

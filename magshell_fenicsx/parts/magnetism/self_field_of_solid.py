@@ -43,7 +43,10 @@ class SelfFieldOfSolid(SelfField):
     """Field of a model's solid, from charges of faces and interiors of cells.
 
     Methods have the contracts of `SelfField`. `edges` are own cells and their local faces that are
-    charged.
+    charged. Private fields of the base class: `_owned` is the number of this rank's cells,
+    `_is_convected` says whether the remanence moves with F and nothing is induced, and
+    `_interpolation` is the element of F^-1 J if not. `_jets` gives the value and the reference
+    derivatives of a nodal field at the points of that element.
     """
 
     def _remanence_function(self) -> fem.Function:
@@ -58,12 +61,12 @@ class SelfFieldOfSolid(SelfField):
 
         Its degree is above the displacement's, since F^-1 J is no polynomial.
         """
-        family, degree = (
-            basix.ElementFamily.P,
-            self._model.r0.function_space.element.basix_element.degree + DEGREE_INCREMENT,
-        )
+        degree_of_u = self._model.r0.function_space.element.basix_element.degree
         return basix.create_element(
-            family, basix.CellType.hexahedron, degree, basix.LagrangeVariant.gll_warped
+            basix.ElementFamily.P,
+            basix.CellType.hexahedron,
+            degree_of_u + DEGREE_INCREMENT,
+            basix.LagrangeVariant.gll_warped,
         )
 
     def families(
@@ -126,6 +129,7 @@ class SelfFieldOfSolid(SelfField):
         G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
         F, n0 = np.eye(3) + H @ np.linalg.inv(G), unit(np.cross(X[1], X[2]))
         J, soft = np.zeros_like(n0), magnetisation.soft
+        # the remanence, moved with F or with its rotation; a soft magnet alone has none
         if not (soft and soft.alone):
             carrier = F
             if magnetisation.law == "rotation":
@@ -133,6 +137,7 @@ class SelfFieldOfSolid(SelfField):
                 U, _, W = np.linalg.svd(F)
                 carrier = U @ W
             J = np.einsum("cqij,cqj->cqi", carrier, Br)
+        # what the applied field induces
         if soft:
             # F^-T n0: the deformed normal of layers
             n = unit(np.asarray(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None]))[..., 0])
@@ -147,24 +152,29 @@ class SelfFieldOfSolid(SelfField):
         `r0` and `u` are jets (4, cells, nodes, 3) of undeformed places and displacements at the
         interpolation nodes.
         """
+        # the remanence at the interpolation nodes, then F and J there
         element = self.Br.function_space.element.basix_element
         T = element.tabulate(0, self._interpolation.points)[0, :, :, 0]
-        F, J = self._polarised(r0, u, np.einsum("mk,nki->nmi", T, self._nodal_remanence()), mu)
+        Br = np.einsum("mk,nki->nmi", T, self._nodal_remanence())
+        F, J = self._polarised(r0, u, Br, mu)
         return np.asarray(np.linalg.solve(F, J[..., None])[..., 0])
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
         """Return the moment (3,) of this rank's modelled cells, over R³."""
         V = self._model.r0.function_space
         points, weights = basix.make_quadrature(V.mesh.basix_cell(), QUADRATURE_DEGREE)
+        # shape functions of u and of Br with derivatives at the points; then jets of X and u there
         T, TB = (
-            f.element.basix_element.tabulate(1, points)[..., 0] for f in (V, self.Br.function_space)
+            space.element.basix_element.tabulate(1, points)[..., 0]
+            for space in (V, self.Br.function_space)
         )
         nodes = V.dofmap.list[: self._owned]
         X, u = (
             np.einsum("dqk,cki->dcqi", T, f.x.array.reshape(-1, 3)[nodes])
             for f in (self._model.r0, self._model.system.u)
         )
-        _, J = self._polarised(X, u, np.einsum("qk,cki->cqi", TB[0], self._nodal_remanence()), mu)
+        Br = np.einsum("qk,cki->cqi", TB[0], self._nodal_remanence())
+        _, J = self._polarised(X, u, Br, mu)
         # undeformed volume of each point; the moment is the integral of J over it
         volume = np.abs(np.linalg.det(np.moveaxis(X[1:], 0, -1))) * weights
         return np.asarray(np.einsum("cq,cqi->i", volume, J))

@@ -83,16 +83,17 @@ def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
     `turn` is the azimuth of that frame about e3 in radians.
     """
     sections: dict[str, SensorSection] = context.sections.get("sensors") or {}
-    # of the shell's own field and of the applied one
-    shell, field_units = context.shell, units(context)
+    # flux densities of a remanence of length one, and of lambda_m = 1
+    shell, (unit_of_own, unit_of_applied) = context.shell, units(context)
     R, half = shell.reference, 0.5 / shell.R_over_h
     return tuple(
         Sensor(
             name,
-            rotation(turn) @ np.array(section.position) / R,
-            section.field == "total",
-            *field_units,
-            half,
+            place=rotation(turn) @ np.array(section.position) / R,
+            total=section.field == "total",
+            own=unit_of_own,
+            applied=unit_of_applied,
+            half=half,
         )
         for name, section in sections.items()
     )
@@ -161,7 +162,7 @@ def refuse_unfit_reading(key: str, context: Context) -> None:
     if context.section_of(MagneticSection) is None:
         raise ValueError(f"{key}: need magnetic: nothing is magnetised, and no field applied")
     context.needs(key, "the whole shell")
-    # the thickness follows from the area
+    # where the thickness follows from the area, this must be that of the drawn shell
     if "a thickness that does not change" in context.missing_offers:
         context.needs(key, "the area as drawn")
 
@@ -176,7 +177,10 @@ def refuse_unknown_field(key: str, field: str, context: Context) -> None:
     CaseError
         With the key.
     """
-    if field == "total" and not np.isfinite(units(context)[1]):
+    if field != "total":
+        return
+    _, unit_of_applied = units(context)  # nan if unknown
+    if not np.isfinite(unit_of_applied):
         raise CaseError(
             f"{key}.field: total: lambda_m does not say how strong the applied field is: give "
             "remanent.flux_density and applied.flux_density, or field: own"
@@ -198,17 +202,18 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
 
     outline_of_shell = outline(shell)
     chart, half = np.asarray(outline_of_shell.inverse(x), dtype=float), 0.5 / shell.R_over_h
+    # the method of Gauss and Newton for the nearest place of the surface, the foot
     for _ in range(NEWTON_STEPS):
+        # the foot at the present chart, and places a small step along each coordinate
         steps = np.vstack([chart, *(chart + DIFFERENCE_STEP * e for e in np.eye(len(chart)))])
         foot, *neighbours = outline_of_shell.embedding(steps)
-        # Gauss and Newton: tangents by differences, nearest foot by least squares
         tangents = np.array([place - foot for place in neighbours]).T / DIFFERENCE_STEP
-        newton_step = np.linalg.lstsq(tangents, x - foot, rcond=None)[0]
-        # through space and back: charts beyond the edge return to it
-        next_foot = outline_of_shell.embedding((chart + newton_step)[None])[0]
+        newton_step, *_ = np.linalg.lstsq(tangents, x - foot, rcond=None)
+        # from the chart to a place and back: a chart beyond the edge returns to the edge
+        (next_foot,) = outline_of_shell.embedding((chart + newton_step)[None])
         next_chart = np.asarray(outline_of_shell.inverse(next_foot), dtype=float)
         if not np.isfinite(next_chart).all():  # the last chart is kept
             break
         chart = next_chart
-    nearest_place = outline_of_shell.embedding(chart[None])[0]
+    (nearest_place,) = outline_of_shell.embedding(chart[None])
     return float(np.linalg.norm(x - nearest_place)) - half

@@ -61,7 +61,8 @@ FACE_NODES = basix.create_element(
     lagrange_variant=basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
-# kind of a pair of elements, see `SingularPairs._kinds_of_pair`
+# kind of a pair of elements: ("faces", ...), ("strip", edge, ...) or ("strips", edge, ...), with
+# where they touch and the local sides or corners there
 PairKind = tuple[Any, ...]
 
 
@@ -76,7 +77,7 @@ class Places:
     weights
         (n,)
     at
-        (n, 2) coordinates along and across a strip, in [0, 1]; None for faces.
+        (n, 2) coordinates of the points along and across a strip, in [0, 1]; None for faces.
     """
 
     X: Array
@@ -136,6 +137,10 @@ class SingularPairs:
     ----------
     neighbours
         For each cell of all copies, the cells with a common corner, itself included.
+    _pairs
+        The sums over pairs of points, in C.
+    _shape, _corners, _own, _copies, _include_uncharged
+        The parameters `shape`, `corners`, `own_cells`, `copies` and `include_uncharged`.
     _strips
         (copies * cells, 3) whether each local edge has a charged strip.
     _boundary_sides
@@ -143,9 +148,15 @@ class SingularPairs:
     _scale
         Thickness over a typical side of a cell: on this scale rules are dense.
     _heights
-        Heights of the layers of charges of a cell.
+        (layers,) heights of the layers of charges of a cell, from -1/2 to 1/2.
     _batches
         The pairs of elements with charges, by kinds.
+    _on_faces
+        Charges (modelled cells, nodes, layers) of the faces at the nodes `FACE_NODES`, per area of
+        the reference triangle.
+    _on_strips
+        For each local edge, charges (modelled cells, nodes) of its strip at the Gauss points of
+        `STRIP_NODES`, per area of the coordinates along and across the strip.
     """
 
     def __init__(
@@ -196,9 +207,12 @@ class SingularPairs:
             energy += self._pairs.add(
                 nodes, batch.pairs, batch.own, left, right, gradient, stiffness
             )
+            # `add` has left sums of derivatives at the points; `finish` brings them to the nodes
             self._pairs.finish(nodes, batch.pairs[:, 0], batch.left, gradient, stiffness)
-            # where the second element's points differ from point to point, `Pairs.add` has done it
-            if batch.right.tables.ndim == 3:
+            # a second element with points of its own for each first point has no such sums: `add`
+            # has brought its derivatives to the nodes already
+            is_shared = batch.right.tables.ndim == 3
+            if is_shared:
                 self._pairs.finish(nodes, batch.pairs[:, 1], batch.right, gradient, stiffness)
         return energy
 
@@ -213,9 +227,10 @@ class SingularPairs:
         return at_boundary
 
     def _common_side(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
-        """Return the local number in cell d of a side of cell c, and `flip` of the module.
+        """Return the local number in cell d of the local side `edge` of cell c, and `flip`.
 
-        None if cell d does not have the side.
+        `flip` is whether the side runs the other way in cell d. None if cell d does not have the
+        side.
         """
         # the corners of both cells have the same numbers where they coincide
         a, b = (int(self._corners[c, i]) for i in ENDS[edge])
@@ -265,7 +280,11 @@ class SingularPairs:
                     yield "strips", edge, "apart", other_edge
 
     def _kind_of_faces(self, c: int, d: int) -> PairKind:
-        """Return the kind "faces" of two adjacent cells c and d, see `_kinds_of_pair`."""
+        """Return the kind of the faces of two adjacent cells c and d.
+
+        It is ("faces", boundary sides of c, where they touch, and there: local side in c, in d and
+        `flip`, or the local corner of d).
+        """
         boundary_sides = tuple(map(bool, self._boundary_sides[c]))
         if c == d:
             return "faces", boundary_sides, "self"
@@ -307,26 +326,26 @@ class SingularPairs:
         The first cells of the first `own_pairs` pairs are on this rank.
         """
         first, second, is_shared = self._rules_of_pair(kind)
-        # local edges of the strips, see `_kinds_of_pair`; None for faces
+        # a kind is ("faces", ...), ("strip", edge, ...) or ("strips", edge, touch, other edge, ...)
         edge = kind[1] if kind[0] != "faces" else None
         other_edge = kind[3] if kind[0] == "strips" else None
         # shape functions, heights, thickness and charges at the points of the first elements
-        T, layers, t, q = self._points(pairs[:, 0], first, edge)
+        T, layer_heights, t, q = self._points(pairs[:, 0], first, edge)
         weight = 1.0 if kind[0] == "strip" else 0.5  # pairs of equal elements occur in both orders
-        left = Points(T, layers, t, weight * q)
+        left = Points(T, layer_heights, t, weight * q)
         # and of the second ones
-        T, layers, t, q = self._points(pairs[:, 1], second, other_edge)
-        if not is_shared:  # each point of the first element has points of its own on the second
-            P, L = len(first.weights), layers.shape[-1]
+        T, layer_heights, t, q = self._points(pairs[:, 1], second, other_edge)
+        if not is_shared:  # each of P points of the first element has its own on the second
+            P, L = len(first.weights), layer_heights.shape[-1]
             T = T.reshape(P, -1, *T.shape[1:])
-            layers = layers.reshape(P, -1, L)
+            layer_heights = layer_heights.reshape(P, -1, L)
             t = t.reshape(len(t), P, -1)
             q = q.reshape(len(q), P, -1, L)
         return Batch(
             pairs=pairs,
             own=own_pairs,
             left=left,
-            right=Points(T, layers, t, q),
+            right=Points(T, layer_heights, t, q),
             charges_of_left=(first, edge, weight),
             charges_of_right=(second, other_edge, 1.0),
         )
@@ -335,7 +354,8 @@ class SingularPairs:
         """Return the points of both elements of a kind of pairs, and whether they are shared.
 
         If true, the second element has the same points for all points of the first one. Otherwise
-        it has others for each, one group after the other. `kind` is one of `_kinds_of_pair`.
+        it has others for each, one group after the other. The first element of a kind is the faces
+        ("faces") or a strip ("strip", "strips"), the second the faces or, in "strips", a strip.
         """
         if kind[0] == "faces":
             return self._rules_of_faces(kind)
@@ -344,10 +364,16 @@ class SingularPairs:
             if kind[0] == "strip"
             else self._rule_of_strip_at_strip(kind)
         )
-        return Places.of_strip(kind[1], *strip()), second, is_shared
+        edge, (t, eta, weights) = kind[1], strip()  # along and across the first strip
+        return Places.of_strip(edge, t, eta, weights), second, is_shared
 
     def _rules_of_faces(self, kind: PairKind) -> tuple[Places, Places, bool]:
-        """Return `_rules_of_pair` for the faces of two cells."""
+        """Return the points of the faces of both cells, and whether the second ones are shared.
+
+        The points of the first cell are dense at its boundary sides. Where cells touch at a corner
+        the second has one rule, dense at this corner. Else each first point has a polar rule of its
+        own on the second cell.
+        """
         _, boundary_sides, touch, *position = kind
         first = Places(*rule_along_sides(boundary_sides, self._scale))
         if touch == "corner":
@@ -361,7 +387,11 @@ class SingularPairs:
         return first, self._padded([polar(pole, self._scale) for pole in poles]), False
 
     def _rule_of_faces_at_strip(self, kind: PairKind) -> tuple[Places, bool]:
-        """Return the points on the faces of a cell for a strip, and whether they are shared."""
+        """Return the points on the faces of a cell d for a strip, and whether they are shared.
+
+        `kind` is ("strip", edge, where it touches d, and there: local side in d and `flip`, or the
+        local corner of d).
+        """
         _, _, touch, *position = kind
         if touch == "corner":
             (corner_of_other,) = position
@@ -375,10 +405,11 @@ class SingularPairs:
         return self._padded([polar(pole, STRIP_SCALE * self._scale) for pole in poles]), False
 
     def _rule_of_strip_at_strip(self, kind: PairKind) -> tuple[Places, bool]:
-        """Return the points on the strip of `other_edge` for a strip, and whether they are shared.
+        """Return the points on a second strip for a first one, and whether they are shared.
 
-        A point of the first strip is at t along it and at eta across it. `positions` are the places
-        of these points along the other edge.
+        `kind` is ("strips", edge, where they touch, other edge, and there: `flip`, or the common
+        end of the other edge and of the edge). A point of the first strip is at t along it and at
+        eta across it. `positions` are the places of these points along the other edge.
         """
         _, _, touch, other_edge, *position = kind
         t, eta, w = strip()
@@ -416,9 +447,25 @@ class SingularPairs:
     ) -> tuple[Array, Array, Array, Array]:
         """Return shape functions, heights, thickness and charges at points of cells.
 
-        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers). `cells` are numbers
-        among all copies. `edge` is the local edge of strips, None for faces. Thickness is negative
-        where a copy's normal is turned over; charges are times the weights of the points.
+        Parameters
+        ----------
+        cells
+            Numbers of the cells among all copies.
+        points
+            n points on the faces of each cell, or on a strip.
+        edge
+            Local edge of the strip; None for faces.
+
+        Returns
+        -------
+        T
+            (n, 3, k) shape functions and their derivatives by both reference coordinates.
+        layer_heights
+            (n, layers) heights of the layers of charges.
+        t
+            (cells, n) thickness, negative where a copy's normal is turned over.
+        q
+            (cells, n, layers) charges times the weights of the points.
         """
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
@@ -428,18 +475,19 @@ class SingularPairs:
         )
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
         t = normal_signs * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
+        # charges at the points, from those at the nodes of faces or strips
         basis = _basis(points)
-        if points.at is None:
+        if points.at is None:  # faces
             q = np.einsum("mj,njl->nml", basis, self._on_faces[cells], optimize=True)
-            layers = np.broadcast_to(self._heights, (len(X), len(self._heights)))
+            layer_heights = np.broadcast_to(self._heights, (len(X), len(self._heights)))
         else:
             assert edge is not None
             # a strip has one layer; its height is the coordinate across it, from -1/2 to 1/2
             q = (self._on_strips[edge][cells] @ basis.T)[..., None]
-            layers = points.at[:, 1:] - 0.5
+            layer_heights = points.at[:, 1:] - 0.5
         return (
             T,
-            np.ascontiguousarray(layers),
+            np.ascontiguousarray(layer_heights),
             np.ascontiguousarray(t),
             points.weights[:, None] * charge_factors[..., None] * q,
         )
@@ -454,7 +502,8 @@ class SingularPairs:
     ) -> Iterator[tuple[Ints, PointCharges]]:
         """Yield cells, some at a time, with their charges at the nodes `FACE_NODES`.
 
-        With `nodal_derivatives` the charges can add derivatives to them; see `PointCharges`.
+        With `nodal_derivatives`, the charges have a function `add_derivatives`: it turns
+        derivatives by charges into those by nodal values, and adds them to `nodal_derivatives`.
         """
         X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
         # coordinates (a, b) of the square that is folded onto the triangle: X = (a, (1 - a) b). The
@@ -484,8 +533,10 @@ class SingularPairs:
     ) -> Iterator[tuple[int, Ints, PointCharges]]:
         """Yield local edge, cells and charges at the nodes of strips, for each local edge.
 
-        With `nodal_derivatives` the charges can add derivatives to them; see `PointCharges`.
+        With `nodal_derivatives`, the charges have a function `add_derivatives`: it turns
+        derivatives by charges into those by nodal values, and adds them to `nodal_derivatives`.
         """
+        # Gauss points along and across a strip
         (a, _), (b, _) = (gauss(n) for n in STRIP_NODES)
         points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
         for edge in range(3):
@@ -522,7 +573,8 @@ class SingularPairs:
             )
             if nodal_derivatives.by_thickness is not None:
                 self._by_heights(batch, pairs, moved_nodes, weights, nodal_derivatives)
-            # derivatives by charges of both elements, brought to the nodes of their charges
+            # derivatives by charges of both elements, brought to the nodes of their charges: of the
+            # faces (`edge` is None), or of the strip on a local edge
             for side, charges in enumerate((batch.charges_of_left, batch.charges_of_right)):
                 points, edge, factor = charges
                 copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
@@ -555,10 +607,12 @@ class SingularPairs:
         weights: Weights,
         nodal_derivatives: NodalDerivatives,
     ) -> None:
-        """Add the derivatives by the thickness, which moves charges off the mid-surface.
+        """Add the derivatives by the thickness to `nodal_derivatives`.
 
-        `pairs` are those of the batch whose first cell is on this rank. Other arguments are those
-        of `field_derivatives`.
+        The thickness moves charges off the mid-surface. `pairs` are those of the batch whose first
+        cell is on this rank. `moved_nodes` (cells, k, 3) are the nodes of all copies, with a small
+        step along v as imaginary part; derivatives are those of `weights.energy` W +
+        `weights.force` v . dW/du.
         """
         rows, points_of_both = np.arange(len(pairs)), (batch.left, batch.right)
         by_heights = pair_derivatives(

@@ -109,9 +109,11 @@ class SoftMagnet:
 class Sheet:
     """Densities of a soft-magnetic shell or solid in the applied field.
 
-    They take parameters in this order: the susceptibility chi (or the magnetisation state), the
-    scale s, and an amplitude for each uniform part of the field. Then follow these parts, and
-    perhaps the gradient, or the polynomial of a field known by its values.
+    They are functions of the jets (value and derivatives) r0 and u of placement and displacement,
+    or of place X, displacement u and gradient H in a solid. Then they take parameters in this
+    order: the susceptibility chi (or the magnetisation state), the scale s, and an amplitude for
+    each uniform part of the field. Then follow these parts, and perhaps the gradient, or the
+    polynomial of a field known by its values.
 
     Attributes
     ----------
@@ -172,7 +174,7 @@ class Sheet:
     ) -> PointField:
         """Let `field` follow the polynomials of the energy at u and at u = 0, and return it.
 
-        See `saturation` for the polynomials.
+        They are Taylor polynomials in the applied field, by Langevin's law, at each point.
 
         Parameters
         ----------
@@ -207,7 +209,7 @@ class Sheet:
     def _fields_at_points(
         self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array
     ) -> list[Array]:
-        """Return the values (cells, points, 3) of both `fields` at points.
+        """Return the values (cells, points, 3) of the applied field at u and at u = 0, at points.
 
         `x0` and `u` are undeformed places and displacements there. `polynomials` are those of a
         field known by its values, else None.
@@ -238,7 +240,7 @@ class Sheet:
         """Return the energy over E h per area of a shell, less that at u = 0 in the same field.
 
         `law` is the susceptibility or, of a saturating material, its polynomials at u and at u = 0.
-        `s` is the scale and `given` the field, as in `fields`.
+        `s` is the scale. `given` are the amplitudes, then the field's vectors or its polynomial.
         """
         (B, B0), (present, at_first) = self.fields(r0.r, u.r, given), self._halves(law)
         return s**2 * (
@@ -249,7 +251,8 @@ class Sheet:
     def induced(self, r0: Jet, u: Jet, law: Expr, e: Expr, *given: Expr) -> Expr:
         """Return the polarisation along a vector e, in the unit of lambda_m.
 
-        The arguments are those of `energy_per_area`.
+        `law` is the susceptibility or the polynomials of the material. `given` are the amplitudes,
+        then the field's vectors or its polynomial.
         """
         B, _ = self.fields(r0.r, u.r, given)
         present, _ = self._halves(law)
@@ -261,7 +264,8 @@ class Sheet:
         """Return the energy per volume in a solid, in E h R², less its value at u = 0.
 
         Layers of the solid are sheets, with the undeformed normal n0. H is du/dX, h the thickness
-        over R; other arguments are those of `energy_per_area`.
+        over R, s the scale. `law` is the susceptibility or the polynomials of the material. `given`
+        are the amplitudes, then the field's vectors or its polynomial.
         """
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
         return (
@@ -278,7 +282,8 @@ class Sheet:
     ) -> Expr:
         """Return the polarisation along a vector e in a solid, in the unit of lambda_m.
 
-        The arguments are those of `energy_in_solid`.
+        X, u and H = du/dX are place, displacement and its gradient, n0 is the undeformed normal of
+        the layer. `law` and `given` are the material and the field, as for the energy.
         """
         B, _ = self.fields(X, u, given)
         present, _ = self._halves(law)

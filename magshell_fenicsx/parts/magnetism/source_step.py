@@ -264,9 +264,9 @@ class SourcesObservables(Observables):
         return values_by_column
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Return -dPi/dmu, in E h R², at which a source's conjugate is one unit.
+        """Return -dPi/dmu, in E h R², at which a source's conjugate is 1 N, 1 N m or 1 J.
 
-        None for other amplitudes. See `_unit`.
+        None for other amplitudes.
         """
         return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 

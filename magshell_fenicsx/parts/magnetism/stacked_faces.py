@@ -87,7 +87,9 @@ def coefficients_of_nodes(element: basix.finite_element.FiniteElement) -> Array:
 
 
 def corner_distances(x: Array, corners: Array) -> tuple[Array, Array]:
-    """Return the least distance (n,) of places x (n, m, 3) from flat triangles (n, 3, 3).
+    """Return the least distance (n,) of places x (n, m, 3) from flat triangles.
+
+    The triangles have the given `corners` (n, 3, 3).
 
     Returns
     -------
@@ -125,14 +127,15 @@ def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
     if not sides:
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREE)
         return np.array(X), np.array(w)
-    apex = CORNERS.mean(axis=0)  # the tip
-    # with one free side the opposite corner, with two the middle of the third side
+    # the common tip: with three free sides the centre, with one the opposite corner, with two the
+    # middle of the third side
+    apex = CORNERS.mean(axis=0)
     if len(sides) == 1:
         (apex,) = (CORNERS[i] for i in range(3) if i not in sides[0])
     elif len(sides) == 2:
         apex = CORNERS[[i for i in range(3) if not all(i in side for side in sides)]].mean(axis=0)
     # coordinates and weights: a from a side to the apex, dense at the side, and b along the side
-    (a, wa), (b, wb) = graded(ROWS_AT_EDGE, s), gauss(POINTS_ALONG_ROWS)
+    (a, wa), (b, wb) = graded(ROWS_AT_EDGE, s), gauss(POINTS_ALONG_ROWS)  # both on [0, 1]
     points, weights = list[Array](), list[Array]()
     # a triangle between each free side and the apex: X = (1 - a) (place on the side) + a apex
     for i, j in sides:
@@ -180,6 +183,8 @@ class StackedFaces:
 
     Attributes
     ----------
+    _shape, _faces, _copies, _order
+        The parameters of these names.
     _kinds
         The kinds of first cells: which of their sides are free.
     _kind
@@ -188,6 +193,15 @@ class StackedFaces:
         (12, k) shape functions at the places `BORDER`.
     _pairs
         The functions in C.
+    _rules_of_kinds
+        Points (n, 2) and weights (n,) on the first cell, for each of `_kinds`.
+    _structs
+        The cells with these rules for the functions in C, for each of `_kinds`.
+    _heights
+        (S,) heights of the layers of charges, those of both faces first.
+    _nodal_charges
+        Charges (modelled cells, nodes, layers) at the nodes of `CHARGE_ELEMENT`, per area of the
+        reference triangle.
     """
 
     def __init__(
@@ -217,6 +231,43 @@ class StackedFaces:
         that count. `nodes` (cells, k, 3) are present places over R of all copies.
         """
         is_stacked, h = np.zeros(has_rule.shape, dtype=bool), self._shape.h
+        first, second, pair_size = self._candidates(nodes, own_cells, has_rule)
+        if not len(first):
+            return is_stacked
+        first_cell = first + own_cells.start
+        # twelve places on the sides of each cell stand for it
+        border = np.einsum("mk,nki->nmi", self._border, nodes)
+        # distance, and its part along the normal, of the first cell's border from the second cell;
+        # then of the second cell's border from the first cell
+        distance_of_first, height_of_first = corner_distances(border[first_cell], nodes[second, :3])
+        distance_of_second, height_of_second = corner_distances(
+            border[second], nodes[first_cell, :3]
+        )
+        # those of the border that is nearer count
+        first_is_nearer = distance_of_first < distance_of_second
+        distance = np.where(first_is_nearer, distance_of_first, distance_of_second)
+        height = np.where(first_is_nearer, height_of_first, height_of_second)
+        is_near = distance - h < STACKED_DISTANCE * pair_size
+        is_stacked[first, second] = is_near & (height > OVERLAP_DISTANCE * h)
+        return is_stacked
+
+    def _candidates(
+        self, nodes: Array, own_cells: range, has_rule: NDArray[np.uint8]
+    ) -> tuple[Ints, Ints, Array]:
+        """Return the pairs of `has_rule` that are nearly parallel and may be near each other.
+
+        `nodes` (cells, k, 3) are present places, `has_rule` (own cells, cells) marks the pairs.
+
+        Returns
+        -------
+        first
+            (n,) first cell of each pair, counted from the first own cell.
+        second
+            (n,) second cell of each pair.
+        pair_size
+            (n,) diameter of a ball around the larger of both cells.
+        """
+        # a ball around each cell, and its normal
         middle = nodes.mean(axis=1)
         radius = np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)
         normal = unit(
@@ -234,28 +285,9 @@ class StackedFaces:
             - radius[second]
         )
         cosine = np.abs(np.sum(normal[first_cell] * normal[second], axis=-1))
-        may_be_near = ball_distance < h + STACKED_DISTANCE * pair_size
+        may_be_near = ball_distance < self._shape.h + STACKED_DISTANCE * pair_size
         is_candidate = may_be_near & (cosine > MIN_COSINE)
-        if not is_candidate.any():
-            return is_stacked
-        first, second, first_cell, pair_size = (
-            array[is_candidate] for array in (first, second, first_cell, pair_size)
-        )
-        # twelve places on the sides of each cell stand for it
-        border = np.einsum("mk,nki->nmi", self._border, nodes)
-        # distance, and its part along the normal, of the first cell's border from the second cell;
-        # then of the second cell's border from the first cell
-        distance_of_first, height_of_first = corner_distances(border[first_cell], nodes[second, :3])
-        distance_of_second, height_of_second = corner_distances(
-            border[second], nodes[first_cell, :3]
-        )
-        # those of the border that is nearer count
-        first_is_nearer = distance_of_first < distance_of_second
-        distance = np.where(first_is_nearer, distance_of_first, distance_of_second)
-        height = np.where(first_is_nearer, height_of_first, height_of_second)
-        is_near = distance - h < STACKED_DISTANCE * pair_size
-        is_stacked[first, second] = is_near & (height > OVERLAP_DISTANCE * h)
-        return is_stacked
+        return first[is_candidate], second[is_candidate], pair_size[is_candidate]
 
     def add(
         self,
@@ -269,6 +301,8 @@ class StackedFaces:
 
         Of a pair with one own cell it is half the energy, since two ranks count the pair. It is nan
         if two cells overlap. Derivatives are added to `gradient` (cells, k, 3) and `stiffness`.
+        `nodes` (cells, k, 3) are present places over R of all copies, and `is_stacked` (own cells,
+        cells) is the mask of the stacked pairs.
         """
         pairs, is_own_pair = self._ordered(own_cells, is_stacked)
         energy, kinds_of_first_cells = 0.0, self._kind[pairs[:, 0]]
@@ -295,87 +329,148 @@ class StackedFaces:
 
         The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, with
         the energy W and a change v of the nodes. `nodes` (cells, k, 3) are present places of all
-        copies, `moved_nodes` the same with v times a small step as imaginary part. `is_stacked` is
-        that of `find_stacked`.
+        copies, `moved_nodes` the same with v times a small step as imaginary part. `is_stacked`
+        (own cells, cells) is the mask of the stacked pairs.
         """
         on_charges = np.zeros_like(self._nodal_charges)  # derivatives by nodal charges
         row = np.zeros(1, dtype=np.int64)  # of the only pair, in its charged points
-        basis = coefficients_of_nodes(CHARGE_ELEMENT)
-        for first_cell, second_cell in self._ordered(own_cells, is_stacked)[0]:
+        stacked_pairs, _ = self._ordered(own_cells, is_stacked)
+        for first_cell, second_cell in stacked_pairs:
             first_points, first_weights = self._rules_of_kinds[self._kind[first_cell]]
+            struct = self._structs[self._kind[first_cell]]
             rule = self._pairs.visible_points(
-                self._structs[self._kind[first_cell]],
-                nodes,
-                first_cell,
-                second_cell,
-                MAX_VISIBLE_POINTS,
+                struct, nodes, first_cell, second_cell, MAX_VISIBLE_POINTS
             )
             if rule is None:  # overlapping cells have no energy
                 continue
+            # charged points of both cells
             X, w, inward, shift = rule
-            places = first_points, X.reshape(-1, 2)
-            t, q = self._thickness_and_charges(first_cell, first_points)
-            # the charges of the near face are in three layers
-            layers, layer_factors, heights_of_layers = self._extrapolated_layers(t, inward, shift)
-            q = first_weights[:, None] * np.einsum("pls,ps->pl", layer_factors, q)
-            left = Points(self._tabulated(first_points), layers, t[None], q[None])
-            right = self._visible_charges(second_cell, X, w)
-            pairs, sides = np.array([[first_cell, second_cell]]), ((left, row), (right, row))
-            by_charges = pair_derivatives(moved_nodes, pairs, *sides, weights)
-            on_heights = (
-                None
-                if nodal_derivatives.by_thickness is None
-                else pair_derivatives(moved_nodes, pairs, *sides, weights, heights=True)
+            left, layer_factors, heights_of_layers = self._extrapolated_charges(
+                first_cell, inward, shift
             )
-            for side, (cell, points, weight) in enumerate(
-                zip((first_cell, second_cell), places, (first_weights, w.ravel()), strict=True)
-            ):
+            right = self._visible_charges(second_cell, X, w)
+            # derivatives by charges, and by heights if the thickness counts, of both cells
+            pairs, sides = np.array([[first_cell, second_cell]]), ((left, row), (right, row))
+            on_layers = pair_derivatives(moved_nodes, pairs, *sides, weights)
+            on_heights = None
+            if nodal_derivatives.by_thickness is not None:
+                on_heights = pair_derivatives(moved_nodes, pairs, *sides, weights, heights=True)
+            # those of own cells, brought from the points to nodal charges and nodal values
+            first = first_cell, first_points, first_weights
+            second = second_cell, X.reshape(-1, 2), w.ravel()
+            for side, (cell, points, point_weights) in enumerate((first, second)):
                 if cell not in own_cells:
                     continue
-                copy, modelled_cell = divmod(cell, len(self._shape.r0))
-                by_charges_at_points = by_charges[side].reshape(len(points), -1)
-                heights_of_side = self._heights
-                # the first cell: from charges of its layers back to those of its faces
-                if side == 0:
-                    by_charges_at_points = np.einsum(
-                        "pls,pl->ps", layer_factors, by_charges_at_points
-                    )
-                    heights_of_side = heights_of_layers
-                by_charges_at_points = (
-                    self._copies.charge_factors[copy] * weight[:, None] * by_charges_at_points
+                by_charges = on_layers[side].reshape(len(points), -1)
+                cell_heights = self._heights
+                if side == 0:  # from charges of the moved layers back to those of the cell's layers
+                    by_charges = np.einsum("pls,pl->ps", layer_factors, by_charges)
+                    cell_heights = heights_of_layers
+                on_charges[cell % len(self._shape.r0)] += self._by_nodal_charges(
+                    cell, points, point_weights, by_charges
                 )
-                shape_functions = monomials(points, CHARGE_DEGREE) @ basis
-                on_charges[modelled_cell] += shape_functions.T @ by_charges_at_points
                 if on_heights:
                     by_heights = on_heights[side].reshape(len(points), -1)
-                    by_thickness = self._copies.normal_signs[copy] * np.sum(
-                        by_heights * heights_of_side, axis=-1
-                    )
-                    self._shape.add_thickness_derivatives(
-                        np.array([modelled_cell]), points, by_thickness[None], nodal_derivatives
+                    self._add_by_thickness(
+                        cell, points, by_heights, cell_heights, nodal_derivatives
                     )
         # from derivatives by charges to those by nodal values
         charges = self._faces.charges_at(*self._nodes_of_charges, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(np.zeros_like(charges.x), on_charges)
 
+    def _by_nodal_charges(
+        self, cell: int, points: Array, weights: Array, by_charges: Array
+    ) -> Array:
+        """Return derivatives (nodes, S) by the nodal charges of the modelled cell behind a cell.
+
+        `by_charges` (n, S) are derivatives by the charges of layers at `points` (n, 2) of the cell,
+        where charges are multiplied by `weights` (n,).
+        """
+        copy = cell // len(self._shape.r0)
+        by_charges = self._copies.charge_factors[copy] * weights[:, None] * by_charges
+        shape_functions = monomials(points, CHARGE_DEGREE) @ self._charge_basis
+        return np.asarray(shape_functions.T @ by_charges)
+
+    @cached_property
+    def _charge_basis(self) -> Array:
+        """Coefficients (monomials, nodes) of the basis functions of `CHARGE_ELEMENT`."""
+        return coefficients_of_nodes(CHARGE_ELEMENT)
+
+    def _add_by_thickness(
+        self,
+        cell: int,
+        points: Array,
+        by_heights: Array,
+        cell_heights: Array,
+        nodal_derivatives: NodalDerivatives,
+    ) -> None:
+        """Add derivatives by the thickness of a cell to `nodal_derivatives`.
+
+        The thickness moves the cell's layers of charges.
+
+        Parameters
+        ----------
+        points
+            (n, 2) charged points of the cell.
+        by_heights
+            (n, layers) derivatives by the distances of layers from the mid-surface.
+        cell_heights
+            (layers,) or (n, layers) derivatives of these distances by the thickness.
+        """
+        copy, modelled_cell = divmod(cell, len(self._shape.r0))
+        by_thickness = self._copies.normal_signs[copy] * np.sum(by_heights * cell_heights, axis=-1)
+        self._shape.add_thickness_derivatives(
+            np.array([modelled_cell]), points, by_thickness[None], nodal_derivatives
+        )
+
+    def _extrapolated_charges(
+        self, cell: int, inward: Array, shift: Array
+    ) -> tuple[Points, Array, Array]:
+        """Return the charged points of a first cell, with its near face's charges in three layers.
+
+        Parameters
+        ----------
+        inward
+            (n,) 1 where the normal leads away from the second cell, else -1.
+        shift
+            (n,) distance over R by which charges are moved inward.
+
+        Returns
+        -------
+        charged_points
+            The n points of the rule on the cell, with L layers of charges at each.
+        layer_factors
+            (n, L, S) charges of these layers from those of the S layers of the cell.
+        heights_of_layers
+            (n, L) the part of the layers' heights that grows with the thickness.
+        """
+        points, weights = self._rules_of_kinds[self._kind[cell]]
+        t, q = self._thickness_and_charges(cell, points)
+        layer_heights, layer_factors, heights_of_layers = self._extrapolated_layers(
+            t, inward, shift
+        )
+        q = weights[:, None] * np.einsum("pls,ps->pl", layer_factors, q)
+        charged_points = Points(self._tabulated(points), layer_heights, t[None], q[None])
+        return charged_points, layer_factors, heights_of_layers
+
     def _visible_charges(self, cell: int, X: Array, w: Array) -> Points:
         """Return the charged points of a second cell, as seen from P points of the first cell.
 
-        X (P, M, 2) and w (P, M) are the places and weights of these points.
+        Each first point has M points of its own: X (P, M, 2) and w (P, M) are places and weights.
         """
         t, q = self._thickness_and_charges(cell, X.reshape(-1, 2))
         q = w.reshape(1, *w.shape, 1) * q.reshape(1, *w.shape, -1)
         tables = self._tabulated(X.reshape(-1, 2)).reshape(*w.shape, 3, -1)
-        layers = np.broadcast_to(self._heights, q.shape[1:])
-        return Points(tables, layers, t.reshape(1, *w.shape), q)
+        layer_heights = np.broadcast_to(self._heights, q.shape[1:])
+        return Points(tables, layer_heights, t.reshape(1, *w.shape), q)
 
     def _extrapolated_layers(
         self, t: Array, inward: Array, shift: Array
     ) -> tuple[Array, Array, Array]:
         """Return the layers into which the charges at points of the first cell are moved.
 
-        See `layered` of stacked_faces.c.
+        The function `layered` of stacked_faces.c does the same.
 
         Parameters
         ----------
@@ -403,20 +498,29 @@ class StackedFaces:
         layer_factors = np.broadcast_to(np.eye(S + 2, S), (len(t), S + 2, S)).copy()
         layer_factors[n, near_face] = 0.0
         heights_of_layers = np.pad(np.tile(self._heights, (len(t), 1)), ((0, 0), (0, 2)))
-        depths = np.zeros((len(t), S + 2))
+        depths = np.zeros((len(t), S + 2))  # of the layers below the near face, over R
         for j, weight in enumerate(EXTRAPOLATION_WEIGHTS):
+            # the first layer has the near face's number, the others have the numbers S and S + 1
             layer = np.full_like(near_face, S - 1 + j) if j else near_face
             layer_factors[n, layer, near_face] = weight
             heights_of_layers[n, layer] = self._heights[near_face]
-            # below the near face
             depths[n, layer] = (j + 1) * LAYER_DEPTH * self._shape.h
+        # moved inward by `shift`, and the three layers by their depths too
         shifted_heights = heights_of_layers + (inward / t)[:, None] * (shift[:, None] + depths)
         return shifted_heights, layer_factors, heights_of_layers
 
     def _ordered(
         self, own_cells: range, is_stacked: NDArray[np.bool_]
     ) -> tuple[Ints, NDArray[np.bool_]]:
-        """Return the stacked pairs (n, 2), each once, and a mask of those with two own cells."""
+        """Return the stacked pairs, each once, with the cell of the lower `order` first.
+
+        Returns
+        -------
+        pairs
+            (n, 2) first and second cells.
+        is_own_pair
+            (n,) whether both are own cells, of this rank.
+        """
         # rows of `is_stacked` are own cells: pairs of two own cells are there in both orders
         first, second = np.nonzero(is_stacked)
         first = first + own_cells.start
@@ -454,7 +558,10 @@ class StackedFaces:
 
     @cached_property
     def _structs(self) -> list[object]:
-        """Structs `Cells` in C, for each kind of first cells: they differ in the rule alone."""
+        """For each kind of first cells, all cells as the C functions take them (struct `Cells`).
+
+        The structs differ in the rule on the first cell alone.
+        """
         rules = [np.column_stack(gauss(n)).ravel() for n in range(1, MAX_GAUSS_POINTS + 1)]
         shared_arrays = {
             "shape": coefficients_of_nodes(self._shape.element),
@@ -517,9 +624,11 @@ class StackedFaces:
 
     @property
     def _nodes_of_charges(self) -> tuple[Boxes, Array, Array]:
-        """Boxes, points and weights with which `charges_at` gives charges at the nodes.
+        """Arguments of `charges_at` that give charges at the nodes: boxes, points and weights.
 
-        The points are those of the unit square that is folded onto the triangle.
+        A box is a part of the unit square that is folded onto the triangle of a cell: here the
+        undivided square of each cell. The points are those of the square at the nodes, and the
+        weights the inverse of the Jacobian, so that charges are per area of the triangle.
         """
         a, b = CHARGE_ELEMENT.points.T
         return Boxes.undivided(self._faces.count), np.column_stack([a, b / (1 - a)]), 1 / (1 - a)

@@ -3,12 +3,13 @@
 Boxes of level k are cubes of a grid of 2^k places along each axis; level 0 is the root, the last
 level the finest. A box holds the cells whose middles are in it, of one part and one group. A part
 is a set of connected cells; a group holds copies (the modelled cells and their images) whose boxes
-are images of each other. An offset is the vector between the grid
-places of two boxes; pairs with one offset share a translation matrix G. A box's key is (part,
-group, place in the grid). Own cells are those of this rank. Lengths are over R.
+are images of each other. An offset is the vector between the grid places of two boxes; pairs with
+one offset share a translation matrix G: boxes a and b with multipoles Y have the energy
+Y(b) . G Y(a). A box's key is (part, group, place in the grid). Own cells are those of this rank.
+Lengths are over R.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -43,7 +44,7 @@ class Level:
     parent
         (boxes,) box of the level before; empty at the first level.
     one, other
-        (pairs,) boxes that act on each other by multipoles; the first has cells of this rank.
+        (pairs,) boxes that act on each other by multipoles; `one` has cells of this rank.
     offset
         (pairs,) number of the vector between them.
     """
@@ -97,6 +98,8 @@ class Octree:
 
     Attributes
     ----------
+    _places, _own_cells, _acts_on_itself
+        The parameters of these names.
     _size, _origin
         Width over R and lower corner (3,) of the root box, which holds all cells.
     _depth
@@ -146,58 +149,32 @@ class Octree:
         """Return the boxes of cells that have moved, and how they act on each other.
 
         Pairs of boxes are followed from large to small ones. Where both are far apart for their
-        size they act by multipoles; pairs that remain at the finest level act directly.
-
-        Parameters
-        ----------
-        steps
-            (cells, 3) numbers of steps; see `steps_moved`.
-        radii
-            (cells,) radii over R of balls about the cells that contain their charges.
+        size they act by multipoles; pairs that remain at the finest level act directly. `steps`
+        (cells, 3) are the numbers of steps, of the length `step`, by which cells have moved.
+        `radii` (cells,) over R are those of balls about the cells that contain their charges.
         """
         places = self._places + self.step * steps
-        keys, levels = self._keys(places), list[Level]()
+        levels = list[Level]()
         pairs: Ints = np.zeros((0, 2), dtype=np.int64)
-        # place of each cell's box in the grid, level by level
-        grids = [
-            np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)])
-            for k in range(self._depth + 1)
-        ]
-        boxes_of_levels, boxes_before = list[tuple[Ints, Ints, Array, float]](), None
-        for k, grid in enumerate(grids):
-            boxes, of_cell = np.unique(grid, axis=0, return_inverse=True)
-            width = self._size / 2**k
-            boxes_of_levels.append(
-                (boxes, of_cell.reshape(-1), self._origin + (boxes[:, 2:] + 0.5) * width, width)
-            )
-        offsets: dict[tuple[int, ...], int] = {}
-        for k, (boxes, of_cell, middle, width) in enumerate(boxes_of_levels):
-            # pairs of other ranks are left to them
-            has_own_cells = np.zeros(len(boxes), dtype=bool)
-            has_own_cells[of_cell[self._own_cells.start : self._own_cells.stop]] = True
-            # radius of a ball about the box's middle that contains all of its charges
-            radius = np.zeros(len(boxes))
-            np.maximum.at(
-                radius, of_cell, np.linalg.norm(places - middle[of_cell], axis=-1) + radii
-            )
-            if boxes_before is None:  # the root: all pairs of boxes, of different parts or groups
-                parent = np.zeros(0, dtype=np.int64)
+        of_parents: Ints = np.zeros(0, dtype=np.int64)  # the box of each cell at the level before
+        offsets: dict[tuple[int, ...], int] = {}  # vector between boxes -> its number
+        for boxes, of_cell, middle, width in self._boxes_of_levels(places):
+            # pairs of boxes: at the root all of them, then the children of those that remain
+            parent = np.zeros(0, dtype=np.int64)
+            if not levels:
                 pairs = np.stack(
                     np.meshgrid(*2 * [np.arange(len(boxes))], indexing="ij"), axis=-1
                 ).reshape(-1, 2)
             else:
                 parent = np.empty(len(boxes), dtype=np.int64)
-                parent[of_cell] = boxes_of_levels[k - 1][1]
-                pairs = _children(pairs, parent, len(boxes_before))
-            pairs = pairs[has_own_cells[pairs[:, 0]]]
-            if not self._acts_on_itself:
-                pairs = pairs[boxes[pairs[:, 0], 0] != boxes[pairs[:, 1], 0]]
-            distance = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=-1)
-            # far for their size, and of one group
-            is_separated = (radius[pairs].sum(axis=1) < MAX_RADII_OVER_DISTANCE * distance) & (
-                boxes[pairs[:, 0], 1] == boxes[pairs[:, 1], 1]
-            )
+                parent[of_cell] = of_parents
+                pairs = _children(pairs, parent, len(levels[-1].keys))
+            pairs = self._counted(pairs, boxes, of_cell)
+            # pairs that are far for their size act by multipoles, and the others remain
+            radius = _radii_of_boxes(places, radii, of_cell, middle)
+            is_separated = _are_separated(pairs, boxes, middle, radius)
             (one, other), pairs = pairs[is_separated].T, pairs[~is_separated]
+            # numbers of the vectors between these boxes; a new vector gets the next number
             vectors = [tuple(map(int, offset)) for offset in boxes[one, 2:] - boxes[other, 2:]]
             offset_numbers = np.array(
                 [offsets.setdefault(offset, len(offsets)) for offset in vectors], dtype=np.int64
@@ -206,25 +183,62 @@ class Octree:
             order = np.argsort(offset_numbers, kind="stable")
             levels.append(
                 Level(
-                    width,
-                    boxes,
-                    middle,
-                    of_cell,
-                    parent,
-                    one[order],
-                    other[order],
-                    offset_numbers[order],
+                    width=width,
+                    keys=boxes,
+                    middle=middle,
+                    of_cell=of_cell,
+                    parent=parent,
+                    one=one[order],
+                    other=other[order],
+                    offset=offset_numbers[order],
                 )
             )
-            boxes_before = boxes
+            of_parents = of_cell
         # pairs of boxes that remain at the finest level
-        of_cell, count = boxes_of_levels[-1][1], len(boxes_of_levels[-1][0])
+        of_cell, count = levels[-1].of_cell, len(levels[-1].keys)
         acts_directly = np.zeros((count, count), dtype=bool)
         acts_directly[pairs[:, 0], pairs[:, 1]] = True
         near_cells: NDArray[np.bool_] = acts_directly[
             of_cell[self._own_cells.start : self._own_cells.stop, None], of_cell
         ]
         return Tree(levels, self._translation_matrices(list(offsets)), near_cells)
+
+    def _boxes_of_levels(self, places: Array) -> Iterator[tuple[Ints, Ints, Array, float]]:
+        """Yield the boxes of cells at `places` (cells, 3), level by level from the root.
+
+        Yields
+        ------
+        boxes
+            (boxes, 5) keys: part, group and place in the grid of the level.
+        of_cell
+            (cells,) the box of each cell.
+        middle
+            (boxes, 3) centres over R.
+        width
+            Side of the boxes over R.
+        """
+        keys = self._keys(places)
+        for k in range(self._depth + 1):
+            # a place in the finest grid, halved for each level between
+            grid = np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)])
+            boxes, of_cell = np.unique(grid, axis=0, return_inverse=True)
+            width = self._size / 2**k
+            middle = self._origin + (boxes[:, 2:] + 0.5) * width
+            yield boxes, of_cell.reshape(-1), middle, width
+
+    def _counted(self, pairs: Ints, boxes: Ints, of_cell: Ints) -> Ints:
+        """Return those of the pairs (n, 2) of boxes that count on this rank.
+
+        The first box of a pair must have own cells, since other pairs are left to other ranks. A
+        pair of boxes of one part counts only if parts act on themselves. `boxes` (boxes, 5) are
+        the keys of the boxes, `of_cell` (cells,) is the box of each cell.
+        """
+        has_own_cells = np.zeros(len(boxes), dtype=bool)
+        has_own_cells[of_cell[self._own_cells.start : self._own_cells.stop]] = True
+        pairs = pairs[has_own_cells[pairs[:, 0]]]
+        if not self._acts_on_itself:
+            pairs = pairs[boxes[pairs[:, 0], 0] != boxes[pairs[:, 1], 0]]
+        return pairs
 
     def _keys(self, places: Array) -> Ints:
         """Return part, group and place in the finest grid of cells, (cells, 5)."""
@@ -236,7 +250,8 @@ class Octree:
     def _translation_matrices(self, offsets: list[tuple[int, ...]]) -> Array:
         """Return the entries of translation matrices that are not zero, one row for each offset.
 
-        Boxes have the width one; see `Tree.G`. Matrices are kept for later trees.
+        An offset is the vector between two boxes of the width one. Matrices are kept for later
+        trees.
         """
         new_offsets = [offset for offset in offsets if offset not in self._translations]
         if new_offsets:
@@ -247,6 +262,29 @@ class Octree:
         if not offsets:
             return np.zeros((0, ends().sum()))
         return np.stack([self._translations[offset] for offset in offsets])
+
+
+def _radii_of_boxes(places: Array, radii: Array, of_cell: Ints, middle: Array) -> Array:
+    """Return the radius (boxes,) of a ball about each box's middle with all charges of the box.
+
+    Cells have balls of the given `radii` (cells,) about their `places` (cells, 3), and are in the
+    boxes `of_cell` (cells,) with the middles `middle` (boxes, 3).
+    """
+    radius = np.zeros(len(middle))
+    np.maximum.at(radius, of_cell, np.linalg.norm(places - middle[of_cell], axis=-1) + radii)
+    return radius
+
+
+def _are_separated(pairs: Ints, boxes: Ints, middle: Array, radius: Array) -> NDArray[np.bool_]:
+    """Return whether each pair (n, 2) of boxes is far for its size, and of one group.
+
+    `boxes` (boxes, 5) are the keys of the boxes, `middle` (boxes, 3) their middles, and `radius`
+    (boxes,) the radii of the balls with their charges.
+    """
+    distance = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=-1)
+    is_far = radius[pairs].sum(axis=1) < MAX_RADII_OVER_DISTANCE * distance
+    is_of_one_group = boxes[pairs[:, 0], 1] == boxes[pairs[:, 1], 1]
+    return np.asarray(is_far & is_of_one_group)
 
 
 def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:

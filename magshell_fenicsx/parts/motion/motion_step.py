@@ -189,6 +189,18 @@ class TimeSection(Step):
                     f"{key}.{time_key}: {text}: a time with a unit needs shell.density, "
                     "youngs_modulus and lengths"
                 )
+        self._refuse_unfit_histories(key, context)
+
+    def _refuse_unfit_histories(self, key: str, context: Context) -> None:
+        """Check that each history is of a load of the case, in units that this load knows.
+
+        Also, a load that cannot jump must not have a history with jumps. `key` is that of the step.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
         # loads that may have a history: of steps, and of sections without a step. The amplitude of
         # the field is named `field` here; the angle and the time follow from steps of their own
         loads = {case_step.name: case_step.load for case_step in context.steps}

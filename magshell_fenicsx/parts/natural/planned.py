@@ -61,7 +61,7 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
         """
         if value is None:
             return None
-        # a function of a program
+        # a function of a program; what makes the components tells stretches from curvatures
         if isinstance(value, UserField):
             is_stretch = components_of is _stretches
             return value.mapped(
@@ -160,7 +160,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
         for c in map(components, [curvature, *patch_curvatures])
     ):
         return "the natural curvature twists: k12 is not zero"
-    # a direction that is not along the meridians, as the part of e3 in the surface is
+    # along the meridians are the direction "meridian" and the part of e3 in the surface
     is_vertical = [v == 0 for v in direction] == [True, True, False]
     if is_anisotropic(context) and direction != MERIDIAN and not is_vertical:
         return "the natural shape is not along the meridians"
@@ -204,8 +204,23 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
         all(is_mirrored(v) for v in even_components) and all(is_mirrored(v, -1.0) for v in twists)
     ):
         return False
-    if not is_anisotropic(context):
-        return True
+    return not is_anisotropic(context) or _is_frame_mirrored(direction, mirror, x, R)
+
+
+def _is_frame_mirrored(
+    direction: list[float | str] | str, mirror: Mirror, x: Array, R: float
+) -> bool:
+    """Return whether a plane maps the first direction of the frame onto itself or its opposite.
+
+    Parameters
+    ----------
+    direction
+        Three numbers or formulas, or "meridian".
+    x
+        (n, 3) samples of the surface, over R.
+    R
+        Reference length in the unit of the formulas' places.
+    """
     # meridians are mirrored by a plane that contains the axis, or is normal to it
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)

@@ -17,8 +17,8 @@ numbers, at the distance z along the normal n,
 whose metric G^T G is that of the shell's natural forms, linear in z.
 
 A jet is a map with its first and second derivatives at a point; `Forms` are the natural metric,
-curvature and thickness at a point, in UFL. A pattern is a function of undeformed places and unit
-normals. Places are over R, the reference length; h is the thickness. A user field is a function
+curvature and thickness at a point, in UFL. A pattern is a function of undeformed places r0 and unit
+normals n0. Places are over R, the reference length; h is the thickness. A user field is a function
 that a program gives on its mesh. a0 and b0 are metric and curvature of the undeformed surface, T
 and t the stretches of surface and thickness less one, mu_s the amplitude of the stretch.
 """
@@ -215,8 +215,8 @@ def meridians(r0: Array, n0: Array) -> Array:
 def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -> fem.Function:
     """Return the natural shape as a field that may jump between cells of V; collective.
 
-    The field has the 13 numbers of `_numbers` at each node. Formulas are projected onto
-    polynomials.
+    The field has 13 numbers at each node: six of kappa, six of T, and t. Formulas are projected
+    onto polynomials.
 
     Parameters
     ----------
@@ -298,7 +298,8 @@ class Shape:
     Attributes
     ----------
     field
-        The natural shape at amplitudes of one, see `natural_field`.
+        The natural shape at amplitudes of one: 13 numbers at each node, six of kappa, six of T, and
+        t; of a body then the normal and the height over R.
     curvature, stretch
         The amplitudes; None for one that stays 0.
     """
@@ -351,10 +352,11 @@ class Shape:
     def volume_coefficients(self, first: Array, points: Array) -> Array:
         """Return the coefficients (4, cells, places) of det(1 + mu T) (1 + mu t) by powers of mu.
 
-        mu is the amplitude of the stretch. `first` and `points` are those of `volume`.
+        mu is the amplitude of the stretch. `first` (2, cells, places, 3) are the tangents of the
+        undeformed surface at the reference points `points` (places, 2).
         """
         numbers = at_quadrature(self.field, points)
-        # T from the numbers 6 to 11 of the field, see `_numbers`; both halves of it are set
+        # the symmetric T from the numbers 6 to 11 of the field: entries ij, and the same as ji
         T = np.empty((*numbers.shape[:2], 3, 3))
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
         # mixed components (2, 2) of T in the surface, a0^-1 times the covariant ones: their trace
@@ -383,7 +385,7 @@ class Shape:
 def _factors(shape: Shape, amplitudes: Sequence[Expr]) -> tuple[Expr | None, Expr | None]:
     """Return the factors of curvature and stretch; None for one whose amplitude stays zero.
 
-    `amplitudes` are those of the two that vary: curvature first.
+    `amplitudes` are those of the two that vary, none, one or both: curvature before stretch.
     """
     has_curvature, has_stretch = shape.curvature is not None, shape.stretch is not None
     curvature_factor = amplitudes[0] if has_curvature else None
@@ -394,8 +396,9 @@ def _factors(shape: Shape, amplitudes: Sequence[Expr]) -> tuple[Expr | None, Exp
 def _forms(
     r0: Jet, field: Expr, curvature_factor: Expr | None, stretch_factor: Expr | None
 ) -> Forms:
-    """Return the natural forms at a point: strain, bend, metric, area and thickness, see `Forms`.
+    """Return the natural forms at a point: strain, bend, metric, its inverse, area and thickness.
 
+    The strain is (a_n - a0)/2, the bend b_n - b0; area and thickness are over the undeformed ones.
     The equations are those of the module's docstring, with mu_s the stretch factor. A factor of
     None stands for an amplitude that stays zero.
 
@@ -404,7 +407,9 @@ def _forms(
     r0
         Jet of the undeformed placement: the map with its first and second derivatives.
     field
-        The numbers of the natural shape, see `_numbers`.
+        The numbers of the natural shape: six of kappa, six of T, and t.
+    curvature_factor, stretch_factor
+        The present amplitudes, by which these numbers are multiplied.
     """
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
     # the field has kappa from number 0 on, T from 6 on, and t as 12
@@ -413,7 +418,7 @@ def _forms(
     )
     if stretch_factor is None:  # metric and thickness are the undeformed ones
         return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
-    # curvature b0 of the undeformed surface
+    # curvature b0 of the undeformed surface; `up` is the inverse of its metric a0
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
     # stretches s = 1 + t of the thickness and U of the surface, whose components are mixed
@@ -530,7 +535,8 @@ def body_shape(
     Raises
     ------
     MeshError
-        As `natural_field`, or if the body has no such patch.
+        On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no
+        direction; or if the body has no such patch.
     """
     natural = natural.on_cells(body.patches, len(body.layer_bounds))
     # at the nodes of each cell: normals, heights z, and the numbers of the shell; the body has its
@@ -552,8 +558,8 @@ def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
     """Return the growth tensor G = (1 - s z kappa) U + s n n at a point, as a UFL expression.
 
     G (3, 3) is in space; U is the stretch in the surface, s (`thickness_stretch`) the one of the
-    thickness. `field` is that of `body_shape`. `amplitudes` are curvature and stretch, without one
-    that stays zero.
+    thickness. `field` has the 13 numbers of the shell, the normal n and the height z. `amplitudes`
+    are those of curvature and stretch, without one that stays zero.
     """
     curvature_factor, stretch_factor = _factors(shape, amplitudes)
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]

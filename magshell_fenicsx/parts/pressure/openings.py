@@ -152,7 +152,7 @@ def pressed_parts(
     edges
         Name of each edge -> its facets.
     side_of_cells
-        The side that is pressed in each cell, see `side_field`.
+        Field of the side that is pressed in each cell: 1 outside, -1 inside, 0 none.
     """
     topology, sides = side_of_cells.function_space.mesh.topology, sides_of_cells(side_of_cells)
     topology.create_connectivity(1, 2)
@@ -200,7 +200,8 @@ def ring_openings(
     conditions
         Name of an end -> its support.
     sides
-        Name of a shell -> side on which a pressure acts, see `side_of`.
+        Name of a shell -> 1 if it is pressed from outside, -1 from inside. Without any, all shells
+        are pressed from outside.
     """
     ends = {name: place for name, place in ends.items() if side_of(name, sides)}
 

@@ -169,7 +169,8 @@ class BoundarySection(Section, Ability):
                 SymmetryConstraint(reason, mirrors=partial(self._mirrored, context, name))
             )
         frequencies_alone = not context.steps and context.sections.get("frequencies") is not None
-        # then no plane is a mirror (a meridian does not ask: it checks itself whether it is held)
+        # a loaded shell that no support fixes is modelled as a whole: no plane is a mirror. This is
+        # no reason against a meridian, whose model checks by itself whether it is held.
         if not frequencies_alone and not self.fixes:
             constraints.append(SymmetryConstraint(mirrors=no_plane))
         return constraints

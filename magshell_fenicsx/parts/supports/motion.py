@@ -121,7 +121,10 @@ class EdgeSection(PathStep):
         return 1.0 if self.reaction is None and self.control != "reaction" else None
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
-        return change / self.points if by_load else copysign(1e-3 * self.scale(load_start), -change)
+        if by_load:
+            return change / self.points
+        # the reaction, -dPi/d(factor), falls where the factor grows: the signs are opposite
+        return copysign(1e-3 * self.scale(load_start), -change)
 
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
         return abs(change) / self.points if self.control == "reaction" and change else None

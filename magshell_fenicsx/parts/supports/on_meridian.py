@@ -6,7 +6,7 @@ axis; its unknowns are U + V, V and W. rho and z are the distance from the axis 
 facet is a point of the meridian's mesh. A body is a shell, or several that are joined.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,19 +90,22 @@ class Supports:
     def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
         """Return the numbers of the unknowns (U + V, V, W) of waves m that are zero.
 
-        They are those of `wave_conditions`, without a space of waves: nodes have the same numbers
-        in the spaces of displacements and of waves.
+        They follow from the supports, and at the axis from the form of the waves. No space of waves
+        is needed: nodes have the same numbers in the spaces of displacements and of waves.
 
         Parameters
         ----------
         r0
             Undeformed placement, in the space of displacements.
+        m
+            Number of waves around the axis.
         """
         axis, horizontal, axial = (
             fem.locate_dofs_topological(r0.function_space, 0, facets)
             for facets in (self.axis, self.horizontal, self.axial)
         )
-        # of m = 1 all but the coefficient 1, V, as in `wave_conditions`
+        # on the axis all are zero, but V (coefficient 1) of waves m = 1: a shift across the axis
+        # has U = -V
         at_axis = [3 * axis + i for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return np.concatenate([*at_axis, 3 * horizontal, 3 * horizontal + 1, 3 * axial + 2])
 
@@ -111,11 +114,9 @@ class Supports:
 
         A body is a shell, or shells that are joined; `r0` is the undeformed placement.
         """
-        axial_motions, torsional_waves, transverse_waves = (
-            list[Array](),
-            list[Array](),
-            list[Array](),
-        )
+        axial_motions = list[Array]()
+        torsional_waves = list[Array]()
+        transverse_waves = list[Array]()
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
             # 1, rho and z at the nodes of this body, and zero on other bodies
@@ -143,8 +144,8 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     MeshError
         If an end with a plane of symmetry does not lie in one.
     """
-    # lists of facets for the three kinds of conditions; `facets` has the same three lists
-    horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
+    # facets where the displacement across e3 or along e3 is zero, and in planes of symmetry
+    horizontal, axial, mirror = list[Facets](), list[Facets](), list[Facets]()
     named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
         # the facets of the name, and the components x, y, z that are held there
@@ -164,10 +165,20 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
         held_of_U_W = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if components >= part)
         if held_of_U_W:
             named_ends[name] = end, held_of_U_W
-    facets_by_kind = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
     return Supports(
-        meridian.axis, facets_by_kind[0], facets_by_kind[1], facets_by_kind[2], named_ends, meridian
+        axis=meridian.axis,
+        horizontal=_joined(horizontal),
+        axial=_joined(axial),
+        mirror=_joined(mirror),
+        by_name=named_ends,
+        meridian=meridian,
     )
+
+
+def _joined(facets: Sequence[Facets]) -> Facets:
+    """Return facets of several arrays in one, sorted and each once; empty without any."""
+    joined: Facets = np.unique(np.concatenate([np.empty(0, np.int32), *facets]))
+    return joined
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:

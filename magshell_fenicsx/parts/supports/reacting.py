@@ -146,7 +146,7 @@ def observed_reactions(
     mirror
         Mirror of a half model; None if all is modelled.
     frame
-        The model's frame, see `mesh.mirror.rotation`.
+        (3, 3) rotation from the frame of the case to that of the model.
     force, length
         The units E h R and R in the case's units.
     """

@@ -77,7 +77,7 @@ def reactions(
         Mirror of a half model or a sector: the reactions are those of the whole shell.
     """
     system, comm = model.system, model.system.comm
-    R, shares = system.forces(state.u, state.mu), _shares(model)  # R: the residual
+    residual, shares = system.forces(state.u, state.mu), _shares(model)
     axes = system.u.function_space.dofmap.index_map_bs  # components at a node
     # present places (nodes, 3) of this rank's nodes
     r = vectors_in_space(
@@ -89,11 +89,12 @@ def reactions(
         dofs = support.dofs[support.dofs < system.size]
         is_own_image = mirror is not None and mirror.image_of_edge(name) == name
         held_nodes = np.unique(dofs // axes)
-        point = _box(r[held_nodes], mirror if is_own_image else None, comm).mean(axis=0)
-        # forces (nodes, 3), and their moment about the point
-        F, arm = vectors_in_space(shares[name] * R, axes), r - point
+        box_corners = _box(r[held_nodes], mirror if is_own_image else None, comm)
+        point = box_corners.mean(axis=0)
+        # forces F (nodes, 3) at the nodes, and their moment M about the point
+        F, arm = vectors_in_space(shares[name] * residual, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
-        if support.edge:  # the name of the energy that holds the edge's normal
+        if support.edge:  # a clamped edge: the name of the energy that holds its normal
             gradient = vectors_in_space(system.forces(state.u, state.mu, support.edge), axes)
             M = M - np.cross(arm, gradient).sum(axis=0)
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))

@@ -125,6 +125,7 @@ def refuse_unknown(
     MeshError
         With the missing name and those that there are.
     """
+    # edge that a joint has removed -> number of the joint
     joint_of_edge = {
         edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges
     }
@@ -260,7 +261,7 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     normal = axes[2]
     if np.ptp(vertices @ normal) > PLANARITY_TOLERANCE:
         return
-    # the nodes of the edge, moved along the normal
+    # the nodes of the edge are moved along the normal, unless one of them is far from the plane
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
     distance_from_plane = (x[dofs] - centre) @ normal
     largest_distance = domain.comm.allreduce(np.abs(distance_from_plane).max(initial=0.0), MPI.MAX)

@@ -57,8 +57,9 @@ def branched(
     if start_on_branch is None:
         return None
     choice, coarse_solution = start_on_branch
+    larger_scene, _ = coarse_solution
     return rounds(
-        coarse_solution[0].problem,
+        larger_scene.problem,
         choice,
         coarse_solution,
         _on_finer_mesh,
@@ -85,8 +86,8 @@ def branch_error(adapted: Adapted, record: Record) -> float:
     """
     scene, coarse_end = _ended(record)
     choice = adapted.choice
-    finer = Choice(choice.degree + 1, choice.refinement, choice.size)
-    _, fine_end = _on_finer_mesh(scene.problem, finer, (scene, coarse_end))
+    higher_degree = Choice(choice.degree + 1, choice.refinement, choice.size)
+    _, fine_end = _on_finer_mesh(scene.problem, higher_degree, (scene, coarse_end))
     return estimated(coarse_end.value, fine_end.value)
 
 
@@ -113,6 +114,7 @@ def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | 
         scene.remesh = choice.applied  # the mesh of the larger model alone
         last_record: Record | None = None
         try:
+            # the last record in the larger model that is no instability
             for record in follow(scene, search=False, remark=lambda text: None):
                 if record.branch and record.scene is scene:  # the branch stays in the first model
                     break

@@ -81,7 +81,8 @@ def equidistributed(
         The size function, and the factor of the number of cells.
     """
     # the factor of the size that gives each cell the geometric mean of the shares
-    wished_change = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
+    geometric_mean = np.exp(np.log(shares).mean())
+    wished_change = (geometric_mean / shares) ** (1 / (order + 2))
     change = _smoothed(centres, np.clip(wished_change, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
     expected_ratio = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
     # a common factor gives the wanted reduction
@@ -95,8 +96,12 @@ def equidistributed(
 
 
 def _smoothed(centres: Array, wish: Array) -> Array:
-    """Return the geometric means (n,) of `wish` over each cell and its neighbours."""
-    neighbours = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
+    """Return the geometric means (n,) of values `wish` (n,) over each cell and its neighbours.
+
+    `centres` (n, 2) are those of the cells.
+    """
+    # the nearest cell is the cell itself
+    _, neighbours = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)
     return np.asarray(np.exp(np.log(wish)[neighbours].mean(axis=1)))
 
 
@@ -194,13 +199,14 @@ class Adapted:
         on_branch
             The estimated relative error at the end of the branch, or None.
         """
-        best, best_round = self.best, min(self.rounds, key=lambda each: each.estimate)
-        result_tolerance = max(best.estimate, LOAD_TOLERANCE) * abs(best.result)
-        is_same = result is not None and abs(result - best.result) <= result_tolerance
+        # the round of the chosen mesh, and that of the least error
+        chosen, most_exact = self.best, min(self.rounds, key=lambda each: each.estimate)
+        result_tolerance = max(chosen.estimate, LOAD_TOLERANCE) * abs(chosen.result)
+        is_same = result is not None and abs(result - chosen.result) <= result_tolerance
         return {
             "tolerance": self.asked.mesh.tolerance,
-            "error_estimate": best.estimate if is_same else None,
-            "best": {"result": best_round.result, "error_estimate": best_round.estimate}
+            "error_estimate": chosen.estimate if is_same else None,
+            "best": {"result": most_exact.result, "error_estimate": most_exact.estimate}
             if is_same
             else None,
             "rounds": [asdict(each_round) for each_round in self.rounds],

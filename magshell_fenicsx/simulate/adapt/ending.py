@@ -68,6 +68,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its
         shell in `source`, or if one of several shells has no chart.
     """
+    # cells of the source with its values, and places in the chart of this rank's target nodes
     comm, fields = target.comm, CellFields.of_scene(source)
     nodes_in_chart, values = _chart(target), values_of_all_cells(source, u)
     if nodes_in_chart.shape[1] > target.model.V.mesh.topology.dim:  # they are positions in space
@@ -81,9 +82,11 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
     for cells_here, nodes_of_shell in zip(
         cells_of_shells(source), nodes_of_shells(target), strict=True
     ):
+        # mask of the shell's cells, among the cells of all ranks
         is_source_cell = np.concatenate(
             source.model.system.comm.allgather(cells_here[:owned_cells])
         )
+        # cell, position in it and distance from it of each node of the shell
         points = nodes_in_chart[nodes_of_shell]
         cells_in_subset, xi, distances = fields.subset(is_source_cell).places(points)
         cells = np.flatnonzero(is_source_cell)[cells_in_subset]  # numbers among all cells
@@ -134,6 +137,8 @@ class CellFields:
 
     Attributes
     ----------
+    _element
+        The parameter `element`.
     _tree_of_centres
         Search tree of the cells' centres.
     """
@@ -460,7 +465,8 @@ def _instability(end: Record) -> Ending:
     """
     if end.amplitude not in end.point.state.mu:
         raise NoResult("an instability of a turning field is not a single load")
-    own_fold = end.label == "fold" and not end.mode  # no mode: not one that the model excludes
+    # a fold of the model itself; an instability with a mode is one that the model excludes
+    own_fold = end.label == "fold" and not end.mode
     value = end.point.state.mu[end.amplitude]
     return Ending(
         "fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du
@@ -522,6 +528,7 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
     if neighbour.kind in ("held", "instability"):
         return None
     try:
+        # displacement and tangent of the other end, on the mesh of this scene
         u, tangent = (
             carry(source, scene, vector) for vector in (neighbour.state.u, neighbour.tangent)
         )
@@ -530,14 +537,15 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
     # cuts belong to a mesh: those of the other one are of no use here
     guess = with_cuts_here(scene, State(u, dict(neighbour.state.mu)))
     for _ in range(MOST_CHANGED):
-        is_fold = neighbour.kind == "fold"
-        end = (
-            _fold(scene, FoldGuess(guess, tangent), neighbour.name)
-            if is_fold
-            else _equilibrium(scene, guess, neighbour)
-        )
+        if neighbour.kind == "fold":
+            end = _fold(scene, FoldGuess(guess, tangent), neighbour.name)
+        else:
+            end = _equilibrium(scene, guess, neighbour)
+        if end is None:
+            return None
         # cuts and penalties of shells that touch change until they are fit
-        if end is None or (state_with_own_contact := with_own_contact(scene, end.state)) is None:
+        state_with_own_contact = with_own_contact(scene, end.state)
+        if state_with_own_contact is None:
             return end
         guess, tangent = state_with_own_contact, end.tangent
     return None

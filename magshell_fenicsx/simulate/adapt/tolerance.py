@@ -22,7 +22,8 @@ Words and symbols:
   solution is a scene with its end. `carry` evaluates a displacement of one mesh on another one.
 - A choice is degree and mesh; `refinement` divides the default sizes of its elements.
 - A round is a mesh that was tried, with result and estimated error. Its coarse solution has the
-  degree of the choice, its fine solution one degree more.
+  degree of the choice, its fine solution one degree more. Lists of what was tried have pairs of a
+  round and its choice.
 - h and R are thickness and reference length; energies are over E h R^2.
 - `say` prints a line of the log, `doing` sets a line of status.
 """
@@ -129,6 +130,8 @@ class _TangentEnergy:
 
     Attributes
     ----------
+    _scene
+        The parameter `scene`.
     _table, _weights
         Shape functions with two derivatives at the quadrature points, and weights of these.
     _a, _normal
@@ -245,10 +248,8 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
     """
     tolerance, tried = problem.mesh.tolerance, list[tuple[AdaptiveRound, Choice]]()
     assert tolerance is not None
-    refinement, layers = (
-        FIRST_REFINEMENTS[0],
-        (problem.context.section_of(SolidSection) or SolidSection()).layers,
-    )
+    refinement = FIRST_REFINEMENTS[0]
+    layers = (problem.context.section_of(SolidSection) or SolidSection()).layers
     while len(tried) < MOST_ROUNDS:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")
         try:
@@ -270,24 +271,28 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
         )
         if round_result.estimate <= tolerance or refinement >= FINEST:
             break
+        # smaller elements, more layers, or both
         if size_error > ERROR_SHARE * tolerance:
-            # the error falls with the square of the size
-            refinement = round(
-                refinement
-                * float(np.clip((size_error / (ERROR_SHARE * tolerance)) ** 0.5, SLOWEST, FASTEST)),
-                3,
-            )
-            refinement = min(refinement, FINEST)
+            refinement = _finer(refinement, size_error / (ERROR_SHARE * tolerance))
         layers += thickness_error > ERROR_SHARE * tolerance and layers < MOST_LAYERS
     if not tried:
         raise NoResult("the first mesh is too large")
-    best, choice = min(tried, key=lambda t: t[0].estimate)
+    best, choice = min(tried, key=lambda round_and_choice: round_and_choice[0].estimate)
     if best.estimate > tolerance:
         say(
             f"warning: no mesh was found for the tolerance; the least estimated error is "
             f"{best.estimate:.1e}"
         )
     return Adapted(problem, choice, best, [judged_round for judged_round, _ in tried])
+
+
+def _finer(refinement: float, error_ratio: float) -> float:
+    """Return the refinement that lowers an error by a factor, at most `FASTEST` times as fine.
+
+    The error falls with the square of the size.
+    """
+    finer = round(refinement * float(np.clip(error_ratio**0.5, SLOWEST, FASTEST)), 3)
+    return min(finer, FINEST)
 
 
 def _round(
@@ -308,12 +313,12 @@ def _round(
         return by_path(scene).value, scene.cells, scene.model.system.dofs
 
     value, cells, dofs = result(refinement, layers)
-    finer, *_ = result(min(FINER * refinement, FINEST), layers)
-    thicker, *_ = result(refinement, layers + 1)  # one more layer in the same thickness
-    scale = max(abs(finer), np.finfo(float).tiny)
-    # a change from size s to s/q is 1 - 1/q^2 of an error in proportion to s^2
-    size_error = abs(finer - value) / scale / (1 - FINER**-2)
-    thickness_error = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
+    value_if_finer, *_ = result(min(FINER * refinement, FINEST), layers)
+    value_if_more_layers, *_ = result(refinement, layers + 1)  # in the same thickness
+    scale = max(abs(value_if_finer), np.finfo(float).tiny)
+    # from size s to s/q, an error in proportion to s^2 changes by 1 - 1/q^2 of itself
+    size_error = abs(value_if_finer - value) / scale / (1 - FINER**-2)
+    thickness_error = abs(value_if_more_layers - value) / scale / (1 - (layers / (layers + 1)) ** 2)
     return (
         AdaptiveRound(
             SOLID_DEGREE, refinement, cells, dofs, value, size_error + thickness_error, layers
@@ -377,8 +382,8 @@ def rounds(
     """
     tolerance = problem.mesh.tolerance
     assert tolerance is not None
-    # degree by degree, as Newton's method needs a near start
-    for degree in range(PATH_DEGREE + 1, _degree(tolerance) + 1):
+    # to the degree that suits the tolerance, one by one, as Newton's method needs a near start
+    for degree in range(PATH_DEGREE + 1, _fastest_degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
         coarse_solution = transferred(problem, choice, coarse_solution)
     tried_rounds: list[tuple[AdaptiveRound, Choice]] = []
@@ -392,19 +397,17 @@ def rounds(
         )
         round_result = _judged(choice, coarse_solution, fine_solution)
         tried_rounds.append((round_result, choice))
-        say(
-            f"tolerance {tolerance:g}{suffix}: degree {round_result.degree}, {round_result.cells} "
-            "cells, "
-            f"{round_result.dofs} unknowns: "
-            f"result {round_result.result:.9g}, estimated error {round_result.estimate:.1e}"
-        )
-        # a mesh far better than the tolerance is made coarser, but a meridian is cheap anyway
+        say(f"tolerance {tolerance:g}{suffix}: {_words_of_round(round_result)}")
+        # A mesh far better than the tolerance is made coarser. A meridian need not: it is cheap.
         coarse_scene, _ = coarse_solution
         least_error = 0.0 if coarse_scene.problem.axisymmetric else MIN_REDUCTION * tolerance
         if least_error <= round_result.estimate <= tolerance or len(tried_rounds) == MOST_ROUNDS:
             break
         next_choice = _remeshed(
-            choice, coarse_solution, fine_solution, AIM * tolerance / round_result.estimate
+            choice,
+            coarse_solution,
+            fine_solution,
+            reduction=AIM * tolerance / round_result.estimate,
         )
         if next_choice is None:  # there is no other mesh
             break
@@ -413,14 +416,9 @@ def rounds(
             f"{next_choice.degree}, solving"
         )
         choice, coarse_solution = next_choice, transferred(problem, next_choice, fine_solution)
-    rounds_within = [t for t in tried_rounds if t[0].estimate <= tolerance]
-    # the fewest unknowns within the tolerance, or else the least error
-    best, choice = (
-        min(rounds_within, key=lambda t: t[0].dofs)
-        if rounds_within
-        else min(tried_rounds, key=lambda t: t[0].estimate)
-    )
-    if not rounds_within:
+    best, choice = _best_round(tried_rounds, tolerance)
+    is_within = best.estimate <= tolerance
+    if not is_within:
         say(
             f"warning: no mesh was found for the tolerance{suffix}; the least estimated error is "
             f"{best.estimate:.1e}"
@@ -428,7 +426,28 @@ def rounds(
     return Adapted(problem, choice, best, [judged_round for judged_round, _ in tried_rounds])
 
 
-def _degree(tolerance: float) -> int:
+def _words_of_round(round_result: AdaptiveRound) -> str:
+    """Return degree, size, result and estimated error of a round in words."""
+    return (
+        f"degree {round_result.degree}, {round_result.cells} cells, {round_result.dofs} unknowns: "
+        f"result {round_result.result:.9g}, estimated error {round_result.estimate:.1e}"
+    )
+
+
+def _best_round(
+    tried_rounds: list[tuple[AdaptiveRound, Choice]], tolerance: float
+) -> tuple[AdaptiveRound, Choice]:
+    """Return the round with the fewest unknowns within the tolerance, or else of the least error.
+
+    Rounds come with their choices.
+    """
+    rounds_within = [tried for tried in tried_rounds if tried[0].estimate <= tolerance]
+    if rounds_within:
+        return min(rounds_within, key=lambda round_and_choice: round_and_choice[0].dofs)
+    return min(tried_rounds, key=lambda round_and_choice: round_and_choice[0].estimate)
+
+
+def _fastest_degree(tolerance: float) -> int:
     """Return the degree of elements that is the fastest for a tolerance."""
     return next(degree for least_tolerance, degree in DEGREES if tolerance >= least_tolerance)
 
@@ -496,13 +515,13 @@ def _remeshed(
     Choice or None
         None if there is no other mesh, or it would not fit into memory.
     """
-    scene, degree = coarse_solution[0], choice.degree
+    (scene, _), degree = coarse_solution, choice.degree
     order = 2 * degree - 2  # of convergence of an energy
     problem = scene.problem
     is_uniform = problem.axisymmetric or problem.mesh_file or isinstance(problem.shape, Grid)
     if is_uniform:
         refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
-        if reduction < 1 and not scene.problem.axisymmetric:
+        if reduction < 1 and not scene.problem.axisymmetric:  # at least one more line of a grid
             refinement_factor = max(refinement_factor, LINES)
         new_refinement = np.clip(choice.refinement * refinement_factor, COARSEST, FINEST)
         refinement = round(float(new_refinement), 3)
@@ -527,6 +546,7 @@ def _fits(scene: Scene, unknowns: float) -> bool:
         refuse_beyond_memory(
             replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size
         )
-    except CaseError:  # the sum is the number of ranks that refuse
+    except CaseError:
         return not scene.comm.allreduce(1)
+    # every rank adds 1 if it refuses, else 0: the sum is the number of ranks that refuse
     return not scene.comm.allreduce(0)

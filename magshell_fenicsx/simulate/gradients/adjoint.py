@@ -22,6 +22,8 @@ Words and symbols:
 - The conjugate q = -Pi_mu of an amplitude is the displacement on which the amplitude does work. A
   step that holds it makes the amplitude an unknown; the `Device` adds this unknown and its
   equation, a row. A gas gives q as a function of its amplitude.
+- The device takes vectors over its unknowns apart: `displacement` gives the part of the
+  displacement, `rates` that of the amplitudes, by name.
 - A stage is a scene with the solver of one step; `enter` and `leave` convert states of the model to
   states of the step's system and back. Step 0 of a record is the part before all steps.
 - A wave is a displacement with m waves around a meridian, in a space of its own.
@@ -243,7 +245,7 @@ def adjoint_of_instability(
     phi_by_load = dot(  # phi . R_mu
         system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
     )
-    # -phi/(phi . R_mu); with held conjugates it consists of w and multipliers of the rows
+    # -phi/(phi . R_mu), which consists of w and, where conjugates are held, multipliers of the rows
     multipliers = np.asarray(-fold.left_null_vector / phi_by_load)
     rows = stage.device.rates(multipliers) if stage.device else {}
     w = stage.device.displacement(multipliers) if stage.device else multipliers
@@ -277,15 +279,13 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         raise CaseError(
             f"instability: {record.mode}: has no gradient at a T-junction: take symmetry: half"
         )
-    system, waves, state = (
-        model.system,
-        model.waves,
-        model.system.with_moved_supports(record.point.state),
-    )
+    system, waves = model.system, model.waves
+    state = model.system.with_moved_supports(record.point.state)
     refuse_touching_shells(scene, state, f"instability: {record.mode}")
     _, phi = nearest_to_zero(waves.factor_at(state, m))
+    # Q(phi) with its derivatives by u and mu; w; and the total derivative dQ/dmu
     Q = variation(model, state, phi, m, [record.amplitude])
-    w, _ = solved(scene, state, Q, {})
+    w, _ = solved(scene, state, Q, held_conjugates={})
     rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
     # one Newton step towards Q = 0, as the record is there up to the tolerance of locating it
     value = state.mu[record.amplitude] - Q.value / rate
@@ -403,18 +403,14 @@ def adjoint(
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     result = functional(scene, state, column)
     held_conjugates = held_at(scene, record, state, hold)
-    # a prescribed amplitude has no derivative; a sensor has by_mu too, but is no amplitude itself
-    if free_amplitudes := [
-        name for name in result.by_mu if name not in held_conjugates and not result.slope
-    ]:
-        raise CaseError(
-            f"{free_amplitudes[0]}: is a load here, which no parameter changes: hold its conjugate"
-        )
+    _refuse_prescribed_load(result, held_conjugates)
+    # multipliers of the residual, and of the equations that hold conjugates
     w, rows = solved(scene, state, result, held_conjugates)
     # where J is c Pi, the energy of the place gives J_p
     by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
     if result.reaction is not None:
-        # the force J is e . R, so e is a multiplier of R; J_p is left from the unit of forces alone
+        # The result is a force e . R, with unit motions e of supports. So e is a multiplier of R.
+        # Of J_p there remains what comes from the unit of forces.
         unit = force_unit(scene)
         by_itself = lambda there, _: result.value * force_unit(there) / unit  # noqa: E731
         w = w + result.reaction
@@ -434,6 +430,25 @@ def adjoint(
     return with_begins(result_adjoint, record, begins) if hold is None else result_adjoint
 
 
+def _refuse_prescribed_load(result: Functional, held_conjugates: "Held") -> None:
+    """Check that a result is no prescribed amplitude, which has no derivative by a parameter.
+
+    What a sensor reads depends on amplitudes too, but is no amplitude itself.
+
+    Raises
+    ------
+    CaseError
+        With the name of the amplitude.
+    """
+    if prescribed_amplitudes := [
+        name for name in result.by_mu if name not in held_conjugates and not result.slope
+    ]:
+        raise CaseError(
+            f"{prescribed_amplitudes[0]}: is a load here, which no parameter changes: hold its "
+            "conjugate"
+        )
+
+
 def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     """Return an adjoint with further places, the states where steps began; collective.
 
@@ -444,7 +459,8 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     Parameters
     ----------
     adjoint
-        Adjoint with the record's state as its only place.
+        Adjoint with the record's state as its first place; of a barrier, which is a difference, the
+        begin of the step may follow as a second one.
     record
         The record of this state.
     begins
@@ -457,52 +473,32 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         between.
     """
     scene, places, left_loads = adjoint.scene, list(adjoint.places), set[str]()
-    # adjoint with the place at the present record alone; None: J does not depend on this record
+    # adjoint with the places at the present record alone; None: J does not depend on this record
     newest_adjoint: Adjoint | None = adjoint
-    place_number = 0  # index of this place in `places`
+    place_number = 0  # index in `places` of the place at the present record
     # dJ/dmu of loads that keep their value from an earlier step, which is not yet found
     loads = dict[str, float]()
     driven_amplitudes = set[str]()  # that the steps passed so far change
     while record.step:
-        place, step, system = (
-            newest_adjoint.places[0] if newest_adjoint else None,
-            scene.problem.programme[record.step - 1],
-            scene.model.system,
-        )
-        earlier = scene.problem.programme[: record.step - 1]
+        place = newest_adjoint.places[0] if newest_adjoint else None
+        step = scene.problem.programme[record.step - 1]
+        earlier_steps = scene.problem.programme[: record.step - 1]
         driven_amplitudes |= _driven_amplitudes(step, record.point.state.mu)
         held_conjugates = _rows_of_held(step, place) if place else {}
-        if record.step not in begins:
-            if held_conjugates:
-                raise CaseError(
-                    f"{step.key}.hold: {', '.join(held_conjugates)}: give begin, the record before "
-                    "this step"
-                )
+        begin = _begin_of_step(scene, record, begins, held_conjugates, loads)
+        if begin is None:
             break
-        begin, potentials_at_begin, by_mu = (
-            begins[record.step],
-            dict[str, float](),
-            dict[str, float](),
-        )
-        if begin.scene and begin.scene is not scene:
-            if held_conjugates or loads:
-                names = ", ".join({*held_conjugates, *loads})
-                raise CaseError(
-                    f"{names}: as they were before {step.key}, in another model: no gradient"
-                )
-            break
-        state_before = system.with_moved_supports(begin.point.state)
+        state_before = scene.model.system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
-        if newest_adjoint and place:
-            # loads that an earlier step has set, and no step since
-            reused_amplitudes = _amplitudes_of_steps(earlier) & place.state.mu.keys()
-            for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
-                loads[name] = loads.get(name, 0.0) + by_load(newest_adjoint, name)
+        if newest_adjoint:
+            _add_kept_loads(loads, newest_adjoint, earlier_steps, driven_amplitudes)
+        # how J depends on the begin: by conjugates that the step holds as they were there,
+        potentials_at_begin, by_mu = dict[str, float](), dict[str, float]()
         if place:
             potentials_at_begin, by_mu = _terms_of_held(
                 scene, step, place.state, state_before, held_conjugates
             )
-        # such a load was an unknown at this begin if its conjugate was held there: J depends on it
+        # and by loads that were unknowns there, as their conjugates were held
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
@@ -510,25 +506,103 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             places[place_number] = replace(place, follows=frozenset(held_conjugates))
         newest_adjoint = None
         if potentials_at_begin or any(by_mu.values()):
-            by_u = _sum_of_loads(scene, state_before, potentials_at_begin)
-            w, rows = solved(
-                scene, state_before, Functional(0.0, by_u, by_mu, potentials_at_begin), held_before
+            place_at_begin = _place_at_begin(
+                scene, state_before, held_before, potentials_at_begin, by_mu
             )
-            gas = with_gas(held_before)
-            place_at_begin = AdjointState(
-                state_before,
-                w,
-                rows,
-                potentials=potentials_at_begin,
-                steps=begin.step,
-                driven_amplitudes=frozenset(driven_amplitudes),
-                gas=gas,
+            place_at_begin = replace(
+                place_at_begin, steps=begin.step, driven_amplitudes=frozenset(driven_amplitudes)
             )
             place_number = len(places)
             places.append(place_at_begin)
             newest_adjoint = Adjoint(scene, [place_at_begin])
         record = begin
     return replace(adjoint, places=places, left_loads=frozenset(left_loads))
+
+
+def _add_kept_loads(
+    loads: dict[str, float],
+    newest_adjoint: Adjoint,
+    earlier_steps: Sequence[ProgrammeStep],
+    driven_amplitudes: set[str],
+) -> None:
+    """Add dJ/dmu at a place to `loads`, for loads that an earlier step has set, and no step since.
+
+    Collective.
+
+    Parameters
+    ----------
+    loads
+        Amplitude -> dJ/dmu at the places so far.
+    newest_adjoint
+        Adjoint with the places at the present record alone, its state first.
+    driven_amplitudes
+        Amplitudes that later steps change.
+    """
+    place, *_ = newest_adjoint.places
+    reused_amplitudes = _amplitudes_of_steps(earlier_steps) & place.state.mu.keys()
+    for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
+        loads[name] = loads.get(name, 0.0) + by_load(newest_adjoint, name)
+
+
+def _begin_of_step(
+    scene: Scene,
+    record: Record,
+    begins: Begins,
+    held_conjugates: Mapping[str, float],
+    loads: Mapping[str, float],
+) -> Record | None:
+    """Return the record before the step of a record; None if it is not known or in another model.
+
+    Parameters
+    ----------
+    held_conjugates
+        Amplitude whose conjugate the step holds and on which J depends -> its multiplier.
+    loads
+        Loads that keep a value of an earlier step on which J depends -> dJ/dmu.
+
+    Raises
+    ------
+    CaseError
+        If J depends on a begin that is not known, or in another model.
+    """
+    step = scene.problem.programme[record.step - 1]
+    if record.step not in begins:
+        if held_conjugates:
+            raise CaseError(
+                f"{step.key}.hold: {', '.join(held_conjugates)}: give begin, the record before "
+                "this step"
+            )
+        return None
+    begin = begins[record.step]
+    if begin.scene and begin.scene is not scene:
+        if held_conjugates or loads:
+            names = ", ".join({*held_conjugates, *loads})
+            raise CaseError(
+                f"{names}: as they were before {step.key}, in another model: no gradient"
+            )
+        return None
+    return begin
+
+
+def _place_at_begin(
+    scene: Scene,
+    state: State,
+    held_conjugates: "Held",
+    potentials: Mapping[str, float],
+    by_mu: Mapping[str, float],
+) -> AdjointState:
+    """Return the place of an adjoint where a step began, with its multipliers; collective.
+
+    Parameters
+    ----------
+    held_conjugates
+        Amplitude that is unknown there -> its conjugate.
+    potentials, by_mu
+        How J depends on the state there: amplitude -> factor of dPi/dmu, and amplitude -> dJ/dmu.
+    """
+    by_u = _sum_of_loads(scene, state, potentials)
+    w, rows = solved(scene, state, Functional(0.0, by_u, by_mu, potentials), held_conjugates)
+    return AdjointState(state, w, rows, potentials=potentials, gas=with_gas(held_conjugates))
 
 
 def _sum_of_loads(scene: Scene, state: State, factors: Mapping[str, float]) -> Vector:
@@ -581,7 +655,8 @@ def _terms_of_held(
         law = step.load.hold[name]
         if isinstance(law, Gas):
             gas = enclosed_gas(scene, law.gas, state_before)
-            # derivatives of the gas's conjugate by conjugate and amplitude at the state before
+            # derivatives of the gas's conjugate, by the conjugate and by the amplitude at the state
+            # before
             potential_factor, rate_by_amplitude = gas.by_begin(state.mu[name])
             c[name], by_mu[name] = -multiplier * potential_factor, multiplier * rate_by_amplitude
             continue
@@ -660,7 +735,7 @@ def solved(
     Parameters
     ----------
     functional
-        J with its derivatives.
+        J with its derivatives by u and by amplitudes.
     held_conjugates
         Amplitude that is unknown -> its conjugate; empty: all amplitudes are loads.
 
@@ -747,12 +822,13 @@ def held_at(
         # a step may prescribe the conjugate of its own amplitude, at least at its target
         if step.load.by_conjugate(at_target=record.label == "target"):
             held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
-    for name, kind in (hold or {}).items():
-        if name not in state.mu or kind not in ("load", "conjugate"):
+    for name, held_quantity in (hold or {}).items():
+        if name not in state.mu or held_quantity not in ("load", "conjugate"):
             raise CaseError(
-                f"hold: {name}: {kind}: allowed are load and conjugate of {', '.join(state.mu)}"
+                f"hold: {name}: {held_quantity}: allowed are load and conjugate of "
+                f"{', '.join(state.mu)}"
             )
-        if kind == "conjugate":
+        if held_quantity == "conjugate":
             held_conjugates[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held_conjugates
 

@@ -2,8 +2,9 @@
 
 Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its
 magnitude, the factor of the thickness, the natural curvature in the case's frame, and a deviation
-w0 of the drawn shape along the normal of the perfect one. For a deviation see `shape`. The mass has
-derivatives by the same fields.
+w0 of the drawn shape along the normal of the perfect one. A deviation changes the placement; what
+else follows from the placement is in the module `shape`. The mass has derivatives by the same
+fields.
 
 Words and symbols:
 
@@ -12,6 +13,8 @@ Words and symbols:
   amplitudes.
 - A place is also a point of the surface, where it is an array: (cells, nodes, 3) over R, with the
   components of the axes of the model alone where a meridian is modelled.
+- w also means a function: the vector along which residuals are taken at a place, the multiplier
+  with the motion of supports.
 - `forces` are the derivatives of J by the values of a field: (own cells, nodes, components).
 - A share is a term with its weights in a gradient (`WeightedTerm`): the weight `energy` of dPi/df,
   and the weight `work` of the derivative of the residual along w.
@@ -32,8 +35,11 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_gradient import FieldGradient, WeightedTerm
-from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
+from magshell_fenicsx.assembly.field_gradient import (
+    FieldGradient,
+    WeightedTerm,
+    derivatives_by_field,
+)
 from magshell_fenicsx.assembly.nonlocal_terms import FieldDifferentiable
 from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
@@ -102,44 +108,13 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         If no result of the scene depends on the field, or the result has no derivative by it.
     """
     scene = adjoint.scene
+    # a scene whose terms have the field; if it is another one, the adjoint moves there
     scene_with_field = _with_field(adjoint, name)
     if scene_with_field is not scene:
-        return by_field(_transferred(adjoint, scene_with_field), name, adjoint)
+        return by_field(_transferred(adjoint, scene_with_field), name, origin=adjoint)
+    _refuse_without_derivative(adjoint, name)
     model, kind = scene.model, FIELDS[name]
-    slope = adjoint.slope
-    if slope and name in ("thickness", "deviation"):
-        raise CaseError(
-            f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
-            "magnitude"
-        )
-    if name == "deviation" and (
-        model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
-    ):
-        raise CaseError(
-            "deviation: no gradient beside bodies, or in a field that is known at points of space"
-        )
-
-    def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
-        """Return a field and its gradient (own cells, nodes, components), summed over places.
-
-        The system is put at the state of each place in turn. Collective.
-        """
-        fields_and_gradients = [
-            model.system.at_state(place.state).evaluate(
-                partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
-            )
-            for number, place in enumerate(adjoint.places)
-        ]
-        # the field is the same at all places
-        return fields_and_gradients[-1][0], np.sum(
-            [
-                gradient_at_place
-                for _, gradients_at_place in fields_and_gradients
-                for gradient_at_place in gradients_at_place
-            ],
-            axis=0,
-        )
-
+    over_all_places = partial(_over_all_places, adjoint, origin, name)
     f, forces = over_all_places(kind.coefficient)
     places, normals = (nodal_vectors[: len(forces)] for nodal_vectors in places_of(scene, f))
     if name == "deviation":
@@ -156,6 +131,54 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             )
             forces = forces + np.stack(list(contracted), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
+
+
+def _refuse_without_derivative(adjoint: Adjoint, name: str) -> None:
+    """Check that a result has a derivative by a field, the key `name` of `FIELDS`.
+
+    Raises
+    ------
+    CaseError
+        If a sensor reads the result, or contacts or applied fields have no derivative by the shape.
+    """
+    scene = adjoint.scene
+    if adjoint.slope and name in ("thickness", "deviation"):
+        raise CaseError(
+            f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
+            "magnitude"
+        )
+    if name == "deviation" and (
+        scene.model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
+    ):
+        raise CaseError(
+            "deviation: no gradient beside bodies, or in a field that is known at points of space"
+        )
+
+
+def _over_all_places(
+    adjoint: Adjoint,
+    origin: Adjoint | None,
+    name: str,
+    coefficient_or_name: str | PlacementField,
+) -> tuple[fem.Function, Array]:
+    """Return a field and its gradient (own cells, nodes, components), summed over places.
+
+    The system is put at the state of each place in turn. Parameters are those of `_field_at_place`.
+    Collective.
+    """
+    fields_and_gradients = [
+        adjoint.scene.model.system.at_state(place.state).evaluate(
+            partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
+        )
+        for number, place in enumerate(adjoint.places)
+    ]
+    f, _ = fields_and_gradients[-1]  # the field is the same at all places
+    gradients = [
+        gradient_at_place
+        for _, gradients_at_place in fields_and_gradients
+        for gradient_at_place in gradients_at_place
+    ]
+    return f, np.sum(gradients, axis=0)
 
 
 def _field_at_place(
@@ -198,11 +221,42 @@ def _field_at_place(
     ]
     if origin:  # contact is to be the same in the scene that has the field
         expand_shell_contact(origin.scene, scene, origin.places[number].state)
-    shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
+    # terms with weights, and the vector along which their residuals are taken
+    shares, w = _shares(adjoint, number, place, name), _direction_of_residuals(scene, place)
     coefficient = (
         coefficient_or_name if isinstance(coefficient_or_name, str) else coefficient_or_name.name
     )
-    f = next(
+    # the field: in a form, in a term that provides its own derivatives, or in J itself
+    f = _coefficient_in_forms(shares, coefficient_or_name)
+    known_gradients = [
+        field_and_gradient
+        for term in self_differentiating_terms
+        if (field_and_gradient := _known_gradient(term, place, w, coefficient))
+    ]
+    f = f or next((known_field for known_field, _ in known_gradients), None)
+    if f is None and slope and slope.field is not None and coefficient == slope.field.name:
+        f = slope.field
+    if f is None or (not model.thin and coefficient != "Br"):
+        raise CaseError(f"{name}: the case has no such field: no result depends on it")
+    # gradients of terms with derivatives of their own, then of forms
+    gradients = [gradient_at_points for _, gradient_at_points in known_gradients]
+    if coefficient_or_name == "r0":
+        gradients.append(_gradient_by_placement(adjoint, number, place, shares, f, w))
+    else:
+        gradients.append(derivatives_by_field(shares, f, model.u, w, model.kernels))
+    # J itself, as what a sensor reads, counts once: at the first place
+    if slope and slope.by_field is not None and slope.field is not None and not number:
+        gradients += [slope.by_field] if coefficient == slope.field.name else []
+    if name == "thickness" and scene.problem.loads.contacts:
+        gradients.append(_by_start_of_bodies(scene, shares, f, w))
+    return f, gradients
+
+
+def _coefficient_in_forms(
+    shares: Sequence[WeightedTerm], coefficient_or_name: str | PlacementField
+) -> fem.Function | None:
+    """Return the first coefficient of terms' forms that is a field or has its name; else None."""
+    return next(
         (
             candidate
             for share in shares
@@ -211,36 +265,37 @@ def _field_at_place(
         ),
         None,
     )
-    known_gradients = [
-        field_and_gradient
-        for term in self_differentiating_terms
-        if (field_and_gradient := _known_gradient(term, place, w, coefficient))
-    ]
-    # terms that provide their own derivatives may be the only ones with the field
-    f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
-    if f is None and slope and slope.field is not None and coefficient == slope.field.name:
-        f = slope.field
-    if f is None or (not model.thin and coefficient != "Br"):
-        raise CaseError(f"{name}: the case has no such field: no result depends on it")
-    if model.thin and coefficient_or_name == "r0":
+
+
+def _gradient_by_placement(
+    adjoint: Adjoint,
+    number: int,
+    place: AdjointState,
+    shares: list[WeightedTerm],
+    r0: fem.Function,
+    w: fem.Function,
+) -> Array:
+    """Return the gradient (own cells, nodes, 3) of forms by the placement, at one place.
+
+    Beside the derivatives of forms it has those of the measures by which loads are divided, of the
+    widths of cells in penalties, and of normals at points. Collective.
+
+    Parameters
+    ----------
+    number, place
+        Index of the place in `adjoint.places`, and the place itself.
+    shares, w
+        Terms with their weights, and the vector along which their residuals are taken. Terms of
+        measures are added to `shares`.
+    """
+    model = adjoint.scene.model
+    if model.thin:
         shares += of_measures(model, shares, w)
-    gradients = [gradient_at_points for _, gradient_at_points in known_gradients] + [
-        summed(shares, f, model.u, w, model.kernels)
-    ]
-    # J itself, as what a sensor reads, counts once: at the first place
-    if slope and slope.by_field is not None and slope.field is not None and not number:
-        gradients += [slope.by_field] if coefficient == slope.field.name else []
-    if (
-        model.thin
-        and coefficient_or_name == "r0"
-        and (by_vertices := of_widths(model, shares, w)) is not None
-    ):
-        gradients[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
-    if coefficient_or_name == "r0":
-        gradients[-1] += of_normals(adjoint, place, first=not number)
-    if name == "thickness" and scene.problem.loads.contacts:
-        gradients.append(_of_starts(scene, shares, f, w))
-    return f, gradients
+    gradient = derivatives_by_field(shares, r0, model.u, w, model.kernels)
+    if model.thin and (by_vertices := of_widths(model, shares, w)) is not None:
+        gradient[:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+    gradient += of_normals(adjoint, place, first=not number)
+    return gradient
 
 
 def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[PlacementField]:
@@ -276,10 +331,10 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         Name of the field, a key of `FIELDS`.
     """
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
-    # whether the residual counts at this place, on any rank; c may add to w, see `_contracted`
+    # whether the residual counts at this place, on any rank; c adds motions of supports to w
     has_multipliers = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
-    # a term of Pi is multiplied by its amplitude, if it has one: the factor. The derivative by this
-    # amplitude, which c multiplies, is the term without the factor
+    # A term of Pi is multiplied by its amplitude, if it has one: the factor. The derivative by this
+    # amplitude, which c multiplies, is the term without the factor.
     terms_with_factors = [
         (term, factor_of(term.amplitude, mu)) for term in _terms(scene, place.state, name)
     ]
@@ -291,7 +346,7 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         )
         for term, factor in terms_with_factors
     ]
-    shares += _of_parameters(scene, place, name)
+    shares += _shares_of_parameters(scene, place, name)
     # a held conjugate is a fixed multiple of its unit, which depends on the size of the shell
     for held_amplitude in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:
         weight_of_size = (
@@ -355,7 +410,7 @@ def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
     return replace(adjoint, scene=other, places=places, directions=directions)
 
 
-def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[WeightedTerm]:
+def _shares_of_parameters(scene: Scene, place: AdjointState, name: str) -> list[WeightedTerm]:
     """Return the terms of a place that contain conjugates of free parameters, with weights.
 
     The conjugate of a free parameter is an integral of its own, the derivative of energies by it.
@@ -393,7 +448,7 @@ def _as_form(scene: Scene, slope: ParameterDerivative) -> FormTerm:
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
 
-def _of_starts(
+def _by_start_of_bodies(
     scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function
 ) -> Array:
     """Return the derivative by the thickness where bodies start from the shell's face; collective.
@@ -432,7 +487,7 @@ def _of_starts(
             share for share in shares if share.term.name.startswith(f"contact {contact.body}")
         ]
         forces = domain.comm.allreduce(
-            summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1))
+            derivatives_by_field(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1))
         )
         # the thickness at the start is a sum of nodal values times basis functions of one cell
         if (cell_and_basis := _basis_at(model, f, contact.start[axes])) is not None:
@@ -484,7 +539,7 @@ def _basis_at(
     return nearest, element.tabulate(0, barycentric[nearest][None])[0, 0, :, 0]
 
 
-def _contracted(scene: Scene, place: AdjointState) -> fem.Function:
+def _direction_of_residuals(scene: Scene, place: AdjointState) -> fem.Function:
     """Return the vector along which residuals are taken, with the motion of supports; collective.
 
     It is w of the place plus, for each amplitude mu_i that moves supports, c_i times the rate of
@@ -565,8 +620,13 @@ def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
     return spatial_fields.inside_cells(places), normals
 
 
+# The next three are `Projection`s: from derivatives by a coefficient to those by a field. Arguments
+# are the scene, the coefficient f, the derivatives `forces` by its values, and places and normals
+# at its nodes, all by cells.
+
+
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Return the derivative by a factor of the remanence: forces . Br; a `Projection`."""
+    """Return the derivative by a factor of the remanence: forces . Br."""
     Q = f.function_space
     vectors = f.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[: len(forces)]]
     return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
@@ -575,7 +635,7 @@ def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normal
 def _curvatures(
     scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array
 ) -> Array:
-    """Return the derivative by kappa_11, kappa_22, kappa_12 of the natural shape; a `Projection`.
+    """Return the derivative by kappa_11, kappa_22, kappa_12 of the natural shape.
 
     The first six components of `forces` are derivatives by the symmetric tensor of curvature in
     space. They are projected on the tangent frame of the natural shape.
@@ -586,7 +646,7 @@ def _curvatures(
 
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Return the derivative by the deviation w0; a `Projection`.
+    """Return the derivative by the deviation w0.
 
     It is the normal part of the derivative by the placement r0.
     """
@@ -682,7 +742,7 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
         "area of a vertex", scene.model.over_area()(ufl.TestFunction(H))
     )
     fem.assemble_vector(area.x.array, form)
-    _added(area)
+    _add_over_ranks(area)
     # indices: c cell, n node, v vertex of the cell, k component
     hats_at_field_nodes = hat.tabulate(0, nodes)[0, :, :, 0]
     # sum(f H_v), first over the nodes of each cell
@@ -692,7 +752,7 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
         g = fem.Function(H)
         # then over the cells at each vertex
         np.add.at(g.x.array, H.dofmap.list[:count], sums_of_component)
-        _added(g)
+        _add_over_ranks(g)
         # J is that of the whole shell, of which the model may be one of several equal parts
         density_at_vertices.append(g.x.array / area.x.array / scene.model.multiplicity)
     in_cells = np.stack(density_at_vertices, axis=-1)[H.dofmap.list[:count]]
@@ -704,7 +764,7 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
     return values
 
 
-def _added(f: fem.Function) -> None:
+def _add_over_ranks(f: fem.Function) -> None:
     """Add contributions of other ranks at shared vertices, and update ghosts; collective."""
     f.x.scatter_reverse(InsertMode.add)
     f.x.scatter_forward()

@@ -102,10 +102,29 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
     others = {} if others is None else others
     scene = adjoint.scene
     value = number_at_key(scene.problem.context, key)
+    _refuse_shell_number(adjoint, key)
+
+    def contracted(p: float) -> float:
+        """Return J plus equations times multipliers, at fixed states, for a value of the number."""
+        if p != value and p not in others:
+            others[p] = perturbed_scene(scene, key, p)
+        return _contracted_equations(adjoint, other=scene if p == value else others[p])
+
+    return _slope(contracted, value, scale_at_key(scene.problem.context, key))
+
+
+def _refuse_shell_number(adjoint: Adjoint, key: str) -> None:
+    """Check that a number of the shell, by its key, changes no equation of a held conjugate.
+
+    Raises
+    ------
+    CaseError
+        If it changes the law of a gas, or the first contact with a body, on which J depends.
+    """
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
     if (
-        scene.model.contacts
+        adjoint.scene.model.contacts
         and any(place.follows for place in adjoint.places)
         and key.startswith("shell.")
     ):
@@ -114,47 +133,48 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             "shifts it"
         )
 
-    def contracted(p: float) -> float:
-        """Return J plus equations times multipliers, at fixed states, for a value of the number."""
-        if p != value and p not in others:
-            others[p] = perturbed_scene(scene, key, p)
-        scene_at_value = scene if p == value else others[p]
-        first_place, contracted_sum = adjoint.places[0], 0.0
-        # in reverse: `state` after the loop is that of the first place, the state of J
-        for place in reversed(adjoint.places):
-            # the state in the scene at this value, with the loads there
-            own_amplitudes = {  # results and unknowns, which p does not scale
-                *place.rows,
-                *adjoint.left_loads,
-                *([adjoint.free_amplitude] if place.steps is None else []),
-            }
-            state = state_with_new_loads(
-                scene,
-                scene_at_value,
-                _transferred_state(scene, scene_at_value, place.state),
-                own_amplitudes,
-                place.steps,
-            )
-            state = scene_at_value.model.system.with_moved_supports(state)
-            if scene_at_value is not scene:
-                expand_contact(scene, scene_at_value, place.state)
-            residual = _residual_at(scene, scene_at_value, place, state)
-            # at the first place `by_itself` gives J, if there is this function
-            is_by_itself = adjoint.by_itself and place is first_place
-            own_value = 0.0 if is_by_itself else _own_value(scene_at_value, place, state)
-            contracted_sum += residual + own_value
-        if adjoint.by_itself:
-            contracted_sum += adjoint.by_itself(scene_at_value, state)
-        terms = [
-            (factor * factor_of(term.amplitude, state.mu), term)
-            for term, factor in energies_along(scene_at_value, adjoint)
-        ]
-        energies = scene_at_value.model.system.at_state(state).evaluate(
-            lambda: sum(factor * term.energy() for factor, term in terms)
-        )
-        return float(contracted_sum + scene_at_value.model.system.comm.allreduce(energies))
 
-    return _slope(contracted, value, scale_at_key(scene.problem.context, key))
+def _contracted_equations(adjoint: Adjoint, other: Scene) -> float:
+    """Return J plus equations times multipliers, at fixed states, in another scene; collective.
+
+    `other` has the mesh of the adjoint's scene and may be this scene itself.
+    """
+    scene, system = adjoint.scene, other.model.system
+    first_place, contracted_sum = adjoint.places[0], 0.0
+    # in reverse: `state` after the loop is that of the first place, the state of J
+    for place in reversed(adjoint.places):
+        # the state in the other scene, with the loads there
+        own_amplitudes = {  # results and unknowns, which p does not scale
+            *place.rows,
+            *adjoint.left_loads,
+            *([adjoint.free_amplitude] if place.steps is None else []),
+        }
+        state = state_with_new_loads(
+            scene,
+            other,
+            _transferred_state(scene, other, place.state),
+            dependent_names=own_amplitudes,
+            steps=place.steps,
+        )
+        state = system.with_moved_supports(state)
+        if other is not scene:  # places in contact stay
+            expand_contact(scene, other, place.state)
+        residual = _residual_at(scene, other, place, state)
+        # at the first place `by_itself` gives J, if there is this function
+        is_by_itself = adjoint.by_itself and place is first_place
+        own_value = 0.0 if is_by_itself else _own_value(other, place, state)
+        contracted_sum += residual + own_value
+    if adjoint.by_itself:
+        contracted_sum += adjoint.by_itself(other, state)
+    # energies along directions, as of modes
+    terms = [
+        (factor * factor_of(term.amplitude, state.mu), term)
+        for term, factor in energies_along(other, adjoint)
+    ]
+    energies = system.at_state(state).evaluate(
+        lambda: sum(factor * term.energy() for factor, term in terms)
+    )
+    return float(contracted_sum + system.comm.allreduce(energies))
 
 
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
@@ -244,6 +264,7 @@ def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) 
     contracted_sum = dot(
         system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu)
     )
+    # amplitude -> target of the other scene over that of the first, of prescribed conjugates
     targets = target_ratios(scene, other, "conjugate", place.steps)
     for name, multiplier in place.rows.items():
         held_value = -scene.model.system.potential(own_state.u, own_state.mu, name)
@@ -333,7 +354,8 @@ def gradient(
     if of == "instability" or (isinstance(of, str) and of in FOLDS):
         adjoint = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
     else:
-        adjoint = adjoint_at_end(scene, History(record, record, begin, begins=begins), of, hold)[1]
+        history = History(last=record, end=record, begin=begin, begins=begins)
+        _, adjoint = adjoint_at_end(scene, history, of, hold)
     return {name: derivative(adjoint, name) for name in ([by] if isinstance(by, str) else by)}
 
 
@@ -345,7 +367,8 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
     Parameters
     ----------
     by
-        Amplitude, key of a number in the case, or field; see `gradient`.
+        Amplitude, as "lambda_m"; key of a number in the case; or field: "remanence", "magnitude",
+        "thickness", "curvature" or "deviation".
     others
         Value of the number -> scene with this value; filled, for further results of the same scene.
     """
@@ -356,6 +379,7 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
             return replace(field_gradient, forces=unit_size * field_gradient.forces)
         if by in adjoint.state.mu:
             return unit_size * by_amplitude(adjoint, by)
+        # of J times the size of its unit, by the product rule
         return unit_size * by_number(adjoint, by, others) + adjoint.value * size_by_number(
             adjoint, by
         )

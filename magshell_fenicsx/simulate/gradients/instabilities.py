@@ -102,9 +102,10 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
     LostResult
         If the path ends at an instability, and the result is not its amplitude.
     """
-    column = ""  # of a target shape
+    column = ""  # a target shape has none
     if isinstance(result, str):
         column, _ = in_units(scene, end.point.state, result)  # the one without unit
+    # the amplitude itself is a result that has a gradient there
     is_load = end.amplitude in FOLDS.values() and column in (
         end.amplitude,
         quantities.amplitude(end.amplitude).column,
@@ -141,7 +142,9 @@ def instabilities(
     max_count: int = MAX_INSTABILITIES,
     begins: Begins = NO_BEGINS,
 ) -> list[tuple[str, Adjoint]]:
-    """Return the instabilities of a path by name, the lowest first, with their adjoints.
+    """Return the lowest instabilities of a path by name, with their adjoints; collective.
+
+    The lowest comes first.
 
     Parameters
     ----------
@@ -158,7 +161,7 @@ def instabilities(
     -------
     list of (name, adjoint)
         Mode or label of the record, and the adjoint of its amplitude. Those above `MAX_LOAD_RATIO`
-        times the lowest amplitude, and those without a gradient, are left out. Collective.
+        times the lowest amplitude, and those without a gradient, are left out.
 
     Raises
     ------
@@ -184,4 +187,4 @@ def instabilities(
     if not by_name:
         raise LostResult(f"the path has no instability in {amplitude}")
     # sorted again: an adjoint has the exact amplitude, a record that of a point near by
-    return sorted(by_name, key=lambda each: abs(each[1].value))
+    return sorted(by_name, key=lambda name_and_adjoint: abs(name_and_adjoint[1].value))

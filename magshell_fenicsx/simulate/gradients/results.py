@@ -96,56 +96,73 @@ def adjoint_of_barrier(
     refuse_no_barrier(scene.problem)
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
-    system, step, multiplicity = (
-        scene.model.system,
-        scene.problem.programme[-1],
-        scene.model.multiplicity,
-    )
+    step, multiplicity = scene.problem.programme[-1], scene.model.multiplicity
     state_before, state_after = (
-        system.with_moved_supports(record.point.state) for record in (begin, end)
+        scene.model.system.with_moved_supports(record.point.state) for record in (begin, end)
     )
+    # mu_i(end) - mu_i(begin), of the whole shell
     held_conjugates, amplitude_changes = held_at(scene, end, state_after), dict[str, float]()
     for name, conjugate in held_conjugates.items():
         if callable(conjugate):
             raise CaseError(f"barrier: {name}: no gradient while a gas is held")
         amplitude_changes[name] = multiplicity * (state_after.mu[name] - state_before.mu[name])
-    by_u = -np.sum(
-        [
-            amplitude_change * system.load(state_before.u, state_before.mu, name)
-            for name, amplitude_change in amplitude_changes.items()
-        ],
-        axis=0,
-    )
+    # how the conjugates depend on the begin, and on earlier begins
+    at_begin = _place_before_barrier(scene, begin, state_before, amplitude_changes)
+    adjoint_of_conjugates = with_begins(Adjoint(scene, [at_begin]), begin, begins)
+    # Pi at both ends. Rows have the factor zero: they only say that the amplitudes are unknown.
+    zero_vector, zero_rows = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
+    places_at_ends = [
+        AdjointState(state_after, zero_vector, zero_rows, energy=multiplicity),
+        AdjointState(state_before, zero_vector, zero_rows, energy=-multiplicity),
+    ]
+    # further places for loads that keep values which earlier steps have found
+    adjoint_with_begins = with_begins(Adjoint(scene, places_at_ends), end, begins)
+    _, _, *further_places = adjoint_with_begins.places
+    # `at_begin`, in `adjoint_of_conjugates`, replaces the second end: it has -Pi too
+    places = [places_at_ends[0], *adjoint_of_conjugates.places, *further_places]
+    value = barrier(scene, step, state_before, state_after)
+    left_loads = adjoint_of_conjugates.left_loads | adjoint_with_begins.left_loads
+    return Adjoint(scene, places, value=value, left_loads=left_loads)
+
+
+def _place_before_barrier(
+    scene: Scene, begin: Record, state: State, amplitude_changes: Mapping[str, float]
+) -> AdjointState:
+    """Return the place at the begin of a barrier, with -Pi and the conjugates there; collective.
+
+    Its functional is -sum_i (mu_i(end) - mu_i(begin)) dPi/dmu_i, for the amplitudes whose
+    conjugates the step holds.
+
+    Parameters
+    ----------
+    begin, state
+        Last record before the step, and its state with moved supports.
+    amplitude_changes
+        Amplitude -> its change in the step, times the multiplicity.
+    """
+    system = scene.model.system
     potential_factors = {
         name: -amplitude_change for name, amplitude_change in amplitude_changes.items()
     }
-    w, rows = 0.0 * state_before.u, dict[str, float]()
+    w, rows = 0.0 * state.u, dict[str, float]()
     if amplitude_changes:
-        w, rows = solved(
-            scene,
-            state_before,
-            Functional(0.0, by_u, potentials=potential_factors),
-            held_at(scene, begin, state_before),
+        by_u = -np.sum(
+            [
+                amplitude_change * system.load(state.u, state.mu, name)
+                for name, amplitude_change in amplitude_changes.items()
+            ],
+            axis=0,
         )
-    at_begin = AdjointState(
-        state_before, w, rows, -multiplicity, potential_factors, steps=begin.step
+        functional = Functional(0.0, by_u, potentials=potential_factors)
+        w, rows = solved(scene, state, functional, held_at(scene, begin, state))
+    return AdjointState(
+        state,
+        w,
+        rows,
+        energy=-scene.model.multiplicity,
+        potentials=potential_factors,
+        steps=begin.step,
     )
-    adjoint_of_conjugates = with_begins(Adjoint(scene, [at_begin]), begin, begins)
-    # with rows of factor zero: the amplitudes are unknown there
-    zero_vector, zero_rows = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
-    places_at_ends = [
-        AdjointState(state_after, zero_vector, zero_rows, multiplicity),
-        AdjointState(state_before, zero_vector, zero_rows, -multiplicity),
-    ]
-    # loads that keep values which earlier steps have found
-    adjoint_with_begins = with_begins(Adjoint(scene, places_at_ends), end, begins)
-    # its first two places are the ends; `at_begin`, in `adjoint_of_conjugates`, replaces the second
-    places = [places_at_ends[0], *adjoint_of_conjugates.places, *adjoint_with_begins.places[2:]]
-    value, left_loads = (
-        barrier(scene, step, state_before, state_after),
-        adjoint_of_conjugates.left_loads | adjoint_with_begins.left_loads,
-    )
-    return Adjoint(scene, places, value=value, left_loads=left_loads)
 
 
 def refuse_no_result(
@@ -210,8 +227,8 @@ def adjoint_at_end(
     if result == BARRIER:
         return "", adjoint_of_barrier(scene, history.begin, history.end, history.begins)
     if isinstance(result, str) and NAMES.fullmatch(result):
-        # the first of them is the vibration of this name
-        return adjoints_of_vibrations(scene, history.end, result, hold, begins=history.begins)[0]
+        lowest, *_ = adjoints_of_vibrations(scene, history.end, result, hold, begins=history.begins)
+        return lowest  # the vibration of this name, with its kind
     return "", adjoint(scene, history.end, result, hold, history.begins)
 
 

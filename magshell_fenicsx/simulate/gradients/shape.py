@@ -27,8 +27,11 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_gradient import WeightedTerm, broken_space
-from magshell_fenicsx.assembly.field_gradient import derivatives_by_field as summed
+from magshell_fenicsx.assembly.field_gradient import (
+    WeightedTerm,
+    broken_space,
+    derivatives_by_field,
+)
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField
@@ -58,7 +61,7 @@ def of_measures(
     """
     measure_terms, comm, direction = list[WeightedTerm](), model.V.mesh.comm, fem.Function(model.V)
     for share in shares:
-        if share.term.over is None:
+        if share.term.over is None:  # the form of the integral A
             continue
         # dead loads are linear in u, so both weights are taken along one vector
         direction.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
@@ -66,11 +69,12 @@ def of_measures(
             f"{share.term.name} along", ufl.replace(share.term.form, {model.u: direction})
         )
         measure = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
-        value, integral_value = (
+        # the load L/A along this direction, and A
+        load_value, measure_value = (
             comm.allreduce(integral)
             for integral in (fem.assemble_scalar(numerator), measure.energy())
         )
-        measure_terms.append(WeightedTerm(measure, -value / integral_value, 0.0))
+        measure_terms.append(WeightedTerm(measure, -load_value / measure_value, 0.0))
     return measure_terms
 
 
@@ -116,7 +120,11 @@ def of_widths(
                     share.work,
                 )
             )
-    return summed(widened_terms, vertices, model.u, w, model.kernels) if widened_terms else None
+    return (
+        derivatives_by_field(widened_terms, vertices, model.u, w, model.kernels)
+        if widened_terms
+        else None
+    )
 
 
 def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array | float:
@@ -190,6 +198,7 @@ def rates(
         values = list[Array]()
         # central difference, in cells that share no nodes
         for sign in (1, -1):
+            # this node of all own cells moves along its normal, and the field follows
             moved_coordinates = coordinates.copy()
             moved_coordinates[: len(normals), node_number] += (
                 sign * step * normals[:, node_number][:, model.axes]

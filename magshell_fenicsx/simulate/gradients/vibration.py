@@ -28,7 +28,7 @@ Words and symbols:
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,8 +124,17 @@ def refuse_no_vibration(problem: Problem, result: str) -> None:
 
 
 def vibration(scene: Scene, state: State, result: str) -> Vibration:
-    """Return the vibration of a name such as "omega2_1"; see `vibrations`."""
-    return vibrations(scene, state, result)[0]
+    """Return the vibration of a name such as "omega2_1" at a state; collective.
+
+    Modes with equal frequencies are one vibration. The model's tangent is overwritten.
+
+    Raises
+    ------
+    LostResult
+        If the model is a sector, or the vibration cannot be computed.
+    """
+    first, *_ = vibrations(scene, state, result)
+    return first
 
 
 def vibrations(
@@ -166,11 +175,10 @@ def vibrations(
             raise LostResult(f"the model has {len(modes)} vibrations")
         # the group with that number, and higher ones
         groups = [group for group in _groups(modes) if group.numbers[-1] >= number]
-        groups_within_ratio = [
-            group
-            for group in groups
-            if group.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
-        ][:max_count]
+        ratio = max(max_ratio, 1 + DEGENERACY_TOLERANCE)
+        groups_within_ratio = [group for group in groups if group.value <= ratio * groups[0].value][
+            :max_count
+        ]
         # complete: the highest mode is not in the last group, or the model has no more modes
         if groups_within_ratio[-1].numbers[-1] < len(modes) or len(modes) < count:
             return groups_within_ratio
@@ -256,7 +264,8 @@ def adjoints_of_vibrations(
     Returns
     -------
     list of (kind, adjoint)
-        Words for the vibration, see `Vibration.kind`, and the adjoint of its result.
+        Words for the vibration, the label of its mode or of a group of equal frequencies, and the
+        adjoint of its result.
 
     Raises
     ------
@@ -266,6 +275,7 @@ def adjoints_of_vibrations(
         If the mode leaves the symmetry of the model, a body touches the shell, or the mode is a
         wave where shells touch.
     """
+    # the equilibrium with bodies so stiff that their stiffness does not matter
     state = stiffened_equilibrium(scene, scene.model.system.with_moved_supports(record.point.state))
     if bodies := touching_bodies(scene, state):
         raise CaseError(
@@ -274,19 +284,13 @@ def adjoints_of_vibrations(
             "far less than a difference takes; take differences of runs"
         )
     held_conjugates = held_at(scene, record, state, hold)
-    kinds = vibrations(scene, state, result, max_ratio=max_ratio, max_count=max_count)
-    adjoints_of_kinds = [
-        (vibration_of_kind.kind, _adjoint(scene, state, result, vibration_of_kind, held_conjugates))
-        for vibration_of_kind in kinds
+    found = vibrations(scene, state, result, max_ratio=max_ratio, max_count=max_count)
+    adjoints_by_kind = [
+        (each.kind, _adjoint(scene, state, result, each, held_conjugates)) for each in found
     ]
-    return (
-        adjoints_of_kinds
-        if hold is not None
-        else [
-            (kind, with_begins(vibration_of_kind, record, begins))
-            for kind, vibration_of_kind in adjoints_of_kinds
-        ]
-    )
+    if hold is not None:
+        return adjoints_by_kind
+    return [(kind, with_begins(adjoint, record, begins)) for kind, adjoint in adjoints_by_kind]
 
 
 def _adjoint(
@@ -309,10 +313,12 @@ def _adjoint(
     # factor of the eigenvalue of each mode in J, which has their mean
     factor = rate / len(vibration.modes)
     # where shells touch, differences need fixed places in contact: an expansion about the state
-    contact_state = state if any(deep > 0 for _, deep in shell_penetrations(scene, state)) else None
-    if contact_state and _wave(vibration.modes[0]) is not None:
+    shells_touch = any(depth > 0 for _, depth in shell_penetrations(scene, state))
+    contact_state = state if shells_touch else None
+    if contact_state and _wave_number(vibration.modes[0]) is not None:
         refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")
     largest_step = MAX_DIFFERENCE_STEP_IN_CONTACT if contact_state else MAX_DIFFERENCE_STEP
+    # phi . K phi of each mode, with derivatives by u and by unknown amplitudes; and those of J
     with contact_expanded_about(scene, contact_state):
         slopes = [
             _slopes(scene, state, mode, list(held_conjugates), largest_step)
@@ -328,20 +334,13 @@ def _adjoint(
     )
     places, directions = [AdjointState(state, w, rows)], list[EnergyDirection]()
     for mode in vibration.modes:
-        if (m := _wave(mode)) is not None:  # its energies are forms of their own
-            directions.append(
-                EnergyDirection(mode.vector, m, stiffness=factor, inertia=-factor * mode.eigenvalue)
-            )
+        # in J there is factor (phi . K phi - lambda phi . M phi)
+        inertia = -factor * mode.eigenvalue
+        if (m := _wave_number(mode)) is not None:  # its energies are forms of their own
+            directions.append(EnergyDirection(mode.vector, m, stiffness=factor, inertia=inertia))
             continue
-        step = scene.model.system.step_along(mode.vector, largest_step)
-        for offset, weight in DIFFERENCE_WEIGHTS.items():
-            displaced_state = State(state.u + offset * step * mode.vector, state.mu)
-            places.append(
-                AdjointState(
-                    displaced_state, factor * weight / step * mode.vector, dict.fromkeys(rows, 0.0)
-                )
-            )
-        directions.append(EnergyDirection(mode.vector, None, inertia=-factor * mode.eigenvalue))
+        places += _displaced_places(scene, state, mode, factor, rows, largest_step)
+        directions.append(EnergyDirection(mode.vector, None, inertia=inertia))
     # at a fixed eigenvalue J depends on the case by the unit of time alone
     by_itself = lambda there, _: frequency(there.problem, result, vibration.value)  # noqa: E731
     gas = with_gas(held_conjugates)
@@ -356,7 +355,35 @@ def _adjoint(
     )
 
 
-def _wave(mode: ShellMode) -> int | None:
+def _displaced_places(
+    scene: Scene,
+    state: State,
+    mode: ShellMode,
+    factor: float,
+    unknown_names: Iterable[str],
+    largest_step: float,
+) -> list[AdjointState]:
+    """Return the states u + e phi of a mode, with multipliers that are multiples of phi.
+
+    The sum of residuals times multipliers is `factor` times the difference quotient of phi . K phi.
+
+    Parameters
+    ----------
+    unknown_names
+        Amplitudes that are unknown; their rows have the factor zero.
+    largest_step
+        Largest displacement e phi of a difference, over h.
+    """
+    step = scene.model.system.step_along(mode.vector, largest_step)
+    places = []
+    for offset, weight in DIFFERENCE_WEIGHTS.items():
+        displaced_state = State(state.u + offset * step * mode.vector, state.mu)
+        w = factor * weight / step * mode.vector
+        places.append(AdjointState(displaced_state, w, dict.fromkeys(unknown_names, 0.0)))
+    return places
+
+
+def _wave_number(mode: ShellMode) -> int | None:
     """Return the number of waves of a mode around a meridian; 0 of torsion, None of other modes."""
     if mode.label == TORSION:
         return 0
@@ -383,7 +410,7 @@ def _slopes(
         If the mode does not have the model's symmetry, and is no wave.
     """
     system, phi = scene.model.system, mode.vector
-    if (m := _wave(mode)) is not None:
+    if (m := _wave_number(mode)) is not None:
         assert scene.model.axisymmetric
         return variation(scene.model, state, phi, m, held_names)
     if mode.label:
@@ -398,8 +425,7 @@ def _slopes(
         K = symmetric_part(system.tangent(u, state.mu))
         x, y = K.createVecs()
         x.array[:] = phi
-        K.mult(x, y)
-        # differences of K phi between displaced states
+        K.mult(x, y)  # y = K phi
         by_u += difference_factor * y.array_r
         for name in held_names:
             by_mu[name] += float(

@@ -451,7 +451,8 @@ def test_a_wave_that_comes_and_goes_in_contact() -> None:
         "points": 1,
     }
     data = {
-        "shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]], "mesh": {"refinement": 0.5},
+        "shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]],
+        "mesh": {"refinement": 0.5},
         "loading": load | {"loads": [{"edge": "upper.hole", "force": [0, 0, -1]}]},
     }  # fmt: skip
     scene = Scene(Case.from_source(data))

@@ -1,4 +1,4 @@
-"""The second variation along waves: rigid motions, the half shell's tangent, known instabilities."""
+"""The second variation along waves: rigid motions, a half's tangent, known instabilities."""
 
 from dataclasses import replace
 from typing import Any

@@ -109,7 +109,7 @@ def test_residual_and_tangent(density: Any) -> None:
 
 
 def test_symmetry() -> None:
-    """That of the density and of the edge; what prefers a direction along the edge has no mirror."""
+    """That of the density and of the edge. A preferred direction along the edge has no mirror."""
     sided = Mirror(np.array([1.0, 0.0, 0.0]), 0.5, {"right": "left"})
     assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
     assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)

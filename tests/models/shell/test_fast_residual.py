@@ -181,9 +181,14 @@ from magshell_fenicsx.continuation.system import dot, max_abs
 system = model.system
 form = next(t for t in system.terms if t.name == "interior edges")
 forms = FiniteElementSystem(system.u, system.terms, system.clamped, form, 1.0, system._assembler)
-for get in (lambda s: s.residual(u, mu), lambda s: s.load(u, mu, "pressure"), lambda s: s.load(u, mu, "lambda_m")):
+for get in (
+    lambda s: s.residual(u, mu),
+    lambda s: s.load(u, mu, "pressure"),
+    lambda s: s.load(u, mu, "lambda_m"),
+):
     R, reference = get(system), get(forms)
-    size, error = dot(scene.comm, R, R) ** 0.5, max_abs(scene.comm, R - reference) / max_abs(scene.comm, reference)
+    size = dot(scene.comm, R, R) ** 0.5
+    error = max_abs(scene.comm, R - reference) / max_abs(scene.comm, reference)
     if scene.comm.rank == 0:
         print("result", repr(float(size)), repr(float(error)))
 """

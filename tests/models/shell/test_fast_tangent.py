@@ -180,7 +180,8 @@ from magshell_fenicsx.input.source import Source
 
 scene = Scene(Case.from_source(Source("half", {HALF_SHELL!r})))
 model, mu = scene.model, dict(pressure=0.3, lambda_m=0.4)
-x = model.r0.x.array[: model.system.size].reshape(-1, 3)  # each node's own place makes the same u on all ranks
+# each node's own place makes the same u on all ranks
+x = model.r0.x.array[: model.system.size].reshape(-1, 3)
 u = (1e-2 * np.sin(40 * x @ np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]]))).ravel()
 for fast in (model.system, model.symmetry_breaking_modes.system):
     K, v = fast.tangent(u, mu), fast.zero_at_supports(np.roll(u, 3))

@@ -69,7 +69,7 @@ def test_expressions_and_arrays_agree(law: Law) -> None:
 
 
 def test_a_bar_pulled_along_itself() -> None:
-    """Hooke: its width shrinks by Poisson's ratio, its stress is Young's modulus times the strain."""
+    """Hooke: its width shrinks by Poisson's ratio, its stress is Young's modulus times strain."""
     law = Koiter(0.05, 0.3)
     S11, S12, S22 = law.stress(np.diag([1e-3, -0.3e-3]), np.eye(2))
     assert pytest.approx((1e-3, 0, 0), abs=1e-18) == (S11, S12, S22)

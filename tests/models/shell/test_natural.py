@@ -341,7 +341,7 @@ def test_units_of_curvature() -> None:
 
 
 def test_symmetry() -> None:
-    """What grows alike around the axis leaves the meridian, what is the same on both sides a half."""
+    """Growth alike around the axis leaves the meridian. Growth alike on both sides, a half."""
     for natural, model in (
         ({"stretch": ["1 + z", 1]}, "meridian"),
         ({"curvature": [1, 0, 0.5]}, "full shell"),

@@ -74,7 +74,7 @@ def test_neo_hookean_and_mooney_rivlin_terms(
 
 @pytest.mark.parametrize("law", LAWS)
 def test_no_bending_is_free(law: Ogden) -> None:
-    """The energy of bending is positive at every stretch, though W'' is not where alpha is below 2."""
+    """The energy of bending is positive at every stretch, though W'' is not for alpha below 2."""
     E = strains(2000, 0.6)
     basis = np.array([[[1, 0], [0, 0]], [[0, 1], [1, 0]], [[0, 0], [0, 1]]], dtype=float)
     stiff = np.array([np.stack(law.moment(E, K, UP), axis=-1) for K in basis])

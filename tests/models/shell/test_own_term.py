@@ -220,7 +220,7 @@ def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
     "name", ["winkler", "weight along e1", "hydrostatic", "stretching", "one-sided", "tilted"]
 )
 def test_residual_and_tangent(name: str) -> None:
-    """Of the point derivatives against those of the forms; on a shell that has all other terms too."""
+    """Of the point derivatives against those of the forms, on a shell with all other terms too."""
     of, parameters, *_ = DENSITIES[name]
     loads = Loads(pressure=True, magnetic=TILTED, user_terms=(OwnTerm("own", of, parameters),))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads)
@@ -332,9 +332,10 @@ def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
 
 
 def test_half_model_of_another_plane() -> None:
-    """The half shell's frame is turned to its mirror plane, and a direction in this plane with it."""
+    """The half shell's frame is turned to its mirror plane. So is a direction in this plane."""
     settings = [
-        "magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"
+        "magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, "
+        "applied: {polar: 60, azimuth: 20}}"
     ]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     assert make_problem(case, [OwnTerm("own", winkler)]).is_half

@@ -60,7 +60,7 @@ def test_expression_of_position() -> None:
 
 
 def test_patches_jump_at_the_rim() -> None:
-    """Reversed within phi_o: the uniform energy less twice that of the cap, 2 pi (2/3 - c + c^3/3)."""
+    """Reversed within phi_o: the uniform energy less twice the cap's, 2 pi (2/3 - c + c^3/3)."""
     phi_o = 0.6
     c = np.cos(phi_o)
     uniform = -2 * np.pi * 2 / 3

@@ -67,7 +67,10 @@ def test_deflection() -> None:
 
 
 def test_simply_supported_edge() -> None:
-    """w0 = (5 + nu)/(64 (1 + nu)) p R^4/D: Timoshenko, art. 17; no bending term acts at the edge."""
+    """w0 = (5 + nu)/(64 (1 + nu)) p R^4/D: Timoshenko, art. 17.
+
+    No bending term acts at the edge.
+    """
     model = ShellModel(disc(0.2), MATERIAL, 3, {"rim": "simply supported"}, Loads(pressure=True))
     h, nu, D = MATERIAL.h, MATERIAL.nu, MATERIAL.bending_stiffness * MATERIAL.h
     p = 1e-4 * h * 64 * D * (1 + nu) / (5 + nu)

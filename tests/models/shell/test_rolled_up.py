@@ -75,13 +75,14 @@ def test_a_run_rolls_it_up() -> None:
     case = Case.model_validate(
         {
             "shell": {
-                "geometry": "strip", "radius": "1 m", "width": 0.1, "thickness": f"{H} m", "youngs_modulus": "1 Pa",
-                "poisson_ratio": 0.5, "law": "neo-hookean",
+                "geometry": "strip", "radius": "1 m", "width": 0.1, "thickness": f"{H} m",
+                "youngs_modulus": "1 Pa", "poisson_ratio": 0.5, "law": "neo-hookean",
             },
             "boundary": {"root": "clamped", "sides": "symmetry"},
             "points": {"tip": ["1 m", "0 m", "0 m"]},
             "mesh": {"degree": 3, "refinement": 0.5},
-            "loading": {"kind": "dead", "loads": [{"edge": "tip", "moment": f"{M} N"}], "factor": 1, "points": 2},
+            "loading": {"kind": "dead", "loads": [{"edge": "tip", "moment": f"{M} N"}], "factor": 1,
+                        "points": 2},
         }
     )  # fmt: skip
     tip = run(case).rows[-1]

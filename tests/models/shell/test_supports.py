@@ -211,7 +211,7 @@ def test_a_remanence_without_value_is_refused() -> None:
 
 
 def test_energy_of_mirror_edges_is_bending() -> None:
-    """Turning a symmetry edge out of its plane costs bending alone, and all of it is in the column."""
+    """Turning a symmetry edge out of its plane costs bending alone. All of it is in the column."""
     half = scene(PLATE, {"left": "symmetry", "bottom": "clamped"}, {})
     state = half.unloaded()
     x = half.model.r0.x.array.reshape(-1, 3)[: len(state.u) // 3]
@@ -243,7 +243,8 @@ def test_newton_puts_nodes_back_on_oblique_planes() -> None:
     """Nodes that a guess moves off the planes of a sector: an extrapolation multiplies rounding
     from step to step.
     """
-    shell = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 4, "azimuth": [0, 20], "thickness": 0.02,
+    shell = {"geometry": "cap", "radius": 1, "polar": 20, "hole": 4, "azimuth": [0, 20],
+             "thickness": 0.02,
              "youngs_modulus": 1, "poisson_ratio": 0.3}  # fmt: skip
     held = {"rim": "hinged", "left": "symmetry", "right": "symmetry"}
     load = {"loading": {"kind": "pressure"}, "symmetry": "none"}

@@ -92,7 +92,7 @@ def test_damped_vibration_of_plies() -> None:
 
 
 def test_viscous_plies_are_as_stiff() -> None:
-    """Of a thickness that varies; the forces of a smooth velocity are those of the elastic tangent."""
+    """Of a thickness that varies. The forces of a smooth velocity are the elastic tangent's."""
     plies = [ply(20, 3.0, 0.3), ply(-70, 0.7, 0.7)]
     shell = {
         "laminate": {"along": [0.3, 1.0, 0.0], "plies": plies},
@@ -208,7 +208,7 @@ def steps_of(shell: dict[str, Any], steps: list[dict[str, Any]]) -> Case:
 
 @pytest.mark.slow
 def test_damped_vibration_of_a_natural_shape() -> None:
-    """A strip that has rolled up by its natural curvature: a mode of its own, of one freedom too."""
+    """A strip rolled up by its natural curvature: a mode of its own, of one freedom too."""
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
     data = {
         "boundary": {"root": "clamped"},

@@ -187,7 +187,7 @@ PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure":
 
 @pytest.mark.slow
 def test_skew_mirror_planes() -> None:
-    """A sector of a cylinder between planes at 25 and 85 degrees moves as the one between 0 and 60."""
+    """A sector of a cylinder between planes at 25 and 85 degrees moves as that between 0 and 60."""
     given = {
         "boundary": {"left": "symmetry", "right": "symmetry", "bottom": "hinged", "top": "clamped"}
     }
@@ -359,7 +359,7 @@ def test_a_bracket_from_a_mesh_file() -> None:
 
 @pytest.mark.slow
 def test_patches_of_a_mesh_file() -> None:
-    """The gripper on a hub that is clamped: its arms are elasticas at q = 4, which rise by 0.66996."""
+    """The gripper on a clamped hub: its arms are elasticas at q = 4, which rise by 0.66996."""
     case = ms.Case.load(
         CASES / "gripper.yaml", ["model=solid", "mesh.degree=2", "loading.points=2"]
     )

@@ -73,7 +73,8 @@ def test_places() -> None:
     """
     h, at = 1 / 50, {"polar": 30, "azimuth": 50}
     normal = Case.model_validate(
-        {"shell": SHELL, "boundary": {"equator": "clamped"}, "bodies": {"a": {"kind": "plane", "at": at}}}
+        {"shell": SHELL, "boundary": {"equator": "clamped"},
+         "bodies": {"a": {"kind": "plane", "at": at}}}
     ).bodies["a"].at.vector()  # fmt: skip
     (outside,) = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at}}).loads.contacts
     (inside,) = problem(
@@ -118,7 +119,7 @@ def test_symmetry(body: dict[str, Any], model: str) -> None:
 
 
 def test_plane_of_an_oblique_box() -> None:
-    """It holds the axis or is normal to it; another body that is not in the one leaves the other."""
+    """It holds the axis or is normal to it. A body that is not in the one leaves the other."""
     box = {"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 2, 0]}
     found = problem({"a": box}, symmetry="half")
     along = np.degrees(np.arctan2(2, 1))
@@ -178,9 +179,12 @@ BALL = {"kind": "sphere", "radius": 0.5, "position": [0, 0, 0], "direction": [0,
 @pytest.mark.parametrize(
     ("ball", "message"),
     [
-        ({"direction": None}, r"bodies.ball.at: is not given, and the pole is in the hole of the shell: give"),
-        ({"at": {"polar": 10}}, r"bodies.ball.at.polar: 10: is not on the shell: allowed 15 to 85, beside its hole"),
-        ({"at": {"polar": 40, "azimuth": 90}}, r"bodies.ball.at.azimuth: 90: is not on the shell: allowed -10 to 10"),
+        ({"direction": None},
+         r"bodies.ball.at: is not given, and the pole is in the hole of the shell: give"),
+        ({"at": {"polar": 10}},
+         r"bodies.ball.at.polar: 10: is not on the shell: allowed 15 to 85, beside its hole"),
+        ({"at": {"polar": 40, "azimuth": 90}},
+         r"bodies.ball.at.azimuth: 90: is not on the shell: allowed -10 to 10"),
     ],
 )  # fmt: skip
 def test_a_ball_beside_a_hole(ball: dict[str, Any], message: str) -> None:

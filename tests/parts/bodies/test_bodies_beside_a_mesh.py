@@ -1,4 +1,4 @@
-"""A body beside a mesh file stands on the normal of the nearest node, half a thickness from there."""
+"""A body beside a mesh file stands on the nearest node's normal, half a thickness from there."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from conftest import CASES
 from magshell_fenicsx import Case
 
 BRACKET = {
-    "geometry": "mesh", "file": str(CASES.parent / "meshes" / "bracket.msh"), "radius": 1, "thickness": 0.02,
-    "youngs_modulus": 1, "poisson_ratio": 0.3,
+    "geometry": "mesh", "file": str(CASES.parent / "meshes" / "bracket.msh"), "radius": 1,
+    "thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0.3,
 }  # fmt: skip
 
 

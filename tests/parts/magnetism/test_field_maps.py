@@ -33,9 +33,11 @@ from magshell_fenicsx.parts.observables import MapGrid
 from magshell_fenicsx.parts.registered import OBSERVABLES
 
 MM = 1e-3
-CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa",
+CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45,
+       "youngs_modulus": "1 MPa",
        "poisson_ratio": 0.3}  # fmt: skip
-BOX = {"corner": ["-12 mm", "1 mm", "8 mm"], "sides": [["24 mm", 0, 0], [0, "8 mm", 0], [0, 0, "9 mm"]],
+BOX = {"corner": ["-12 mm", "1 mm", "8 mm"],
+       "sides": [["24 mm", 0, 0], [0, "8 mm", 0], [0, 0, "9 mm"]],
        "points": [3, 2, 2], "field": "total"}  # fmt: skip
 BELOW = {
     "corner": ["-2 mm", "-1 mm", "4 mm"],

@@ -34,7 +34,7 @@ MM, MU_0, BR = 1e-3, 4e-7 * np.pi, 0.1
 
 
 def meshed(file: Path, size: float, order: int = 1) -> None:
-    """Write what gmsh's model has, its surfaces part0, part1, ... with edges of the same numbers."""
+    """Write what gmsh's model has: surfaces part0, part1, ..., edges of the same numbers."""
     gmsh.model.occ.synchronize()
     for i, (dim, tag) in enumerate(gmsh.model.getEntities(2)):
         gmsh.model.addPhysicalGroup(2, [tag], name=f"part{i}")
@@ -117,7 +117,7 @@ def force(scene: Scene, h: float) -> Array:
 def test_force_between_coaxial_discs(
     model: Any, tmp_path: Path, gap: float, size: float, radius: float
 ) -> None:
-    """Magpylib's field of one cylinder on the faces of the other, at gaps of 1, 3 and 20 h: 1e-3."""
+    """Magpylib's field of one cylinder on the other's faces, at gaps of 1, 3 and 20 h: 1e-3."""
     h = 0.2
     discs(tmp_path / "discs.msh", radius, (gap + 1) * h, size)
     magnet = magpylib.magnet.Cylinder(polarization=(0, 0, BR), dimension=(2 * radius * MM, h * MM))
@@ -307,7 +307,8 @@ def test_strip_above_a_strip(model: Any, tmp_path: Path) -> None:
 
 CASE = """
 shell:
-  {geometry: mesh, file: strips.msh, unit: mm, radius: 5 mm, thickness: 0.2 mm, youngs_modulus: 20 MPa,
+  {geometry: mesh, file: strips.msh, unit: mm, radius: 5 mm, thickness: 0.2 mm, \
+youngs_modulus: 20 MPa,
    poisson_ratio: 0.3}
 boundary: {edge0: clamped, edge1: clamped}
 magnetic: {remanent: {polar: 30, flux_density: 100 mT}, interaction: others}
@@ -438,7 +439,10 @@ def rooted_strips(file: Path) -> None:
 
 @pytest.mark.slow
 def test_motion_in_a_neighbours_field(model: Any, tmp_path: Path) -> None:
-    """A strip whose neighbour's field doubles swings: kinetic and stored energy are the work, 1e-3."""
+    """A strip whose neighbour's field doubles swings.
+
+    Kinetic and stored energy are the work, 1e-3.
+    """
     rooted_strips(tmp_path / "strips.msh")
     shell = {
         "geometry": "mesh",
@@ -473,7 +477,7 @@ def test_motion_in_a_neighbours_field(model: Any, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
-    """The deflection of a tip by the flux density of both strips: differences of whole runs, 1e-5."""
+    """The deflection of a tip by both strips' flux density: differences of whole runs, 1e-5."""
     rooted_strips(tmp_path / "strips.msh")
 
     def ran(B: float) -> Any:

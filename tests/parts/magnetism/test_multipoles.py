@@ -19,7 +19,7 @@ H, SIDES = 0.02, 5
 
 
 def two_bowls() -> tuple[MagnetisedShell, NDArray[np.intp]]:
-    """A sphere of 8 x 25 triangles, and which half of it each is in; the upper one is moved away."""
+    """A sphere of 8 x 25 triangles, and the half of it each is in. The upper one is moved away."""
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, 2, basix.LagrangeVariant.gll_warped
     )

@@ -206,8 +206,8 @@ def test_a_deformed_cap_against_magpylib(symmetry: str) -> None:
         f"s{i}": {"position": [0.0, 0.0, 0.05]} for i in range(3)
     }  # outside the undeformed cap
     polar = float(np.degrees(np.arctan2(0.6, 0.8)))
-    scene = made(CAP, {"remanent": {"polar": polar, "flux_density": "1 T"}}, sensors, symmetry=symmetry,
-                 mesh={"degree": 4, "size": 1.6 * MM})  # fmt: skip
+    scene = made(CAP, {"remanent": {"polar": polar, "flux_density": "1 T"}}, sensors,
+                 symmetry=symmetry, mesh={"degree": 4, "size": 1.6 * MM})  # fmt: skip
     loads = scene.model.loads
     scene.model.loads = replace(
         loads,
@@ -285,36 +285,46 @@ FIELD = {
     "applied": {"polar": 20, "flux_density": "30 mT"},
 }
 KINDS = {
-    "full": lambda: made(CAP, {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
-                                                     "flux_density": "60 mT"}},
-                         {"hall": {"position": [2 * MM, 1 * MM, 8 * MM], "field": "total"}}, symmetry="none",
-                         mesh={"degree": 2, "size": 0.4}),
-    "half, rotation law": lambda: made(STRIP, {**FIELD, "remanence": "rotation"},
-                                       {"hall": {"position": [20 * MM, 1 * MM, 3 * MM]}}, symmetry="half",
-                                       mesh={"degree": 2, "size": 0.3}, loading={"kind": "field"}),
+    "full": lambda: made(
+        CAP,
+        {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
+                               "flux_density": "60 mT"}},
+        {"hall": {"position": [2 * MM, 1 * MM, 8 * MM], "field": "total"}}, symmetry="none",
+        mesh={"degree": 2, "size": 0.4}),
+    "half, rotation law": lambda: made(
+        STRIP, {**FIELD, "remanence": "rotation"},
+        {"hall": {"position": [20 * MM, 1 * MM, 3 * MM]}}, symmetry="half",
+        mesh={"degree": 2, "size": 0.3}, loading={"kind": "field"}),
     "half, soft": lambda: made(STRIP, {**FIELD, "susceptibility": "1 + x"},
                                {"hall": {"position": [20 * MM, 1 * MM, 3 * MM]}}, symmetry="half",
                                mesh={"degree": 2, "size": 0.3}, loading={"kind": "field"}),
-    "meridian, radial": lambda: made(CAP, {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"},
-                                           "applied": {"flux_density": "30 mT"}},
-                                     {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
-    "meridian, thickness, soft": lambda: made({**CAP, "thickness_factor": "1 + z/4"},
-                                              {"susceptibility": 2, "applied": {"flux_density": "30 mT"}},
-                                              {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "meridian, radial": lambda: made(
+        CAP,
+        {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"},
+         "applied": {"flux_density": "30 mT"}},
+        {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "meridian, thickness, soft": lambda: made(
+        {**CAP, "thickness_factor": "1 + z/4"},
+        {"susceptibility": 2, "applied": {"flux_density": "30 mT"}},
+        {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
     "full, rubber": lambda: made({**CAP, "law": "neo-hookean", "poisson_ratio": 0.5}, FIELD,
                                  {"hall": {"position": [2 * MM, 1 * MM, 8 * MM]}}, symmetry="none",
                                  mesh={"degree": 2, "size": 0.4}),
     "meridian, rubber, rotation law": lambda: made(
         {**CAP, "law": "neo-hookean", "poisson_ratio": 0.5, "thickness_factor": "1 + z/4"},
-        {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"}, "applied": {"flux_density": "30 mT"},
-         "remanence": "rotation"}, {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
-    "solid": lambda: made(BLOCK, {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
-                                                        "flux_density": "60 mT"}},
-                          {"hall": {"position": [12 * MM, 1 * MM, 4 * MM], "field": "total"}}, symmetry="none",
-                          model="solid", mesh={"refinement": 0.3}),
-    "half solid, rotation law, soft": lambda: made(BLOCK, {**FIELD, "susceptibility": "1 + x", "remanence": "rotation"},
-                                                   {"hall": {"position": [12 * MM, 1 * MM, 4 * MM]}}, symmetry="half",
-                                                   model="solid", mesh={"refinement": 0.3}, loading={"kind": "field"}),
+        {**FIELD, "remanent": {"kind": "radial", "flux_density": "60 mT"},
+         "applied": {"flux_density": "30 mT"}, "remanence": "rotation"},
+        {"hall": {"position": [3 * MM, 1 * MM, 12 * MM]}}),
+    "solid": lambda: made(
+        BLOCK,
+        {**FIELD, "remanent": {"kind": "expression", "components": ["1 + x", "y", "z*x"],
+                               "flux_density": "60 mT"}},
+        {"hall": {"position": [12 * MM, 1 * MM, 4 * MM], "field": "total"}}, symmetry="none",
+        model="solid", mesh={"refinement": 0.3}),
+    "half solid, rotation law, soft": lambda: made(
+        BLOCK, {**FIELD, "susceptibility": "1 + x", "remanence": "rotation"},
+        {"hall": {"position": [12 * MM, 1 * MM, 4 * MM]}}, symmetry="half",
+        model="solid", mesh={"refinement": 0.3}, loading={"kind": "field"}),
 }  # fmt: skip
 QUICK = ("full", "meridian, radial", "full, rubber")
 
@@ -391,7 +401,7 @@ def test_gradient_by_a_remanence(law: str) -> None:
 
 
 def test_export_to_magpylib() -> None:
-    """Its field is the sensor's, up to flat triangles, and the moment is Br V/mu0 of a rigid cap."""
+    """Its field is the sensor's, up to flat triangles. The moment is Br V/mu0 of a rigid cap."""
     place = [3 * MM, 1 * MM, 12 * MM]
     here = made(
         CAP, {"remanent": {"polar": 0, "flux_density": "60 mT"}}, {"hall": {"position": place}}
@@ -445,7 +455,8 @@ def test_what_is_refused(
 
 def test_a_sensor_that_the_shell_reaches() -> None:
     """Where the shell has moved over it there is no reading."""
-    here = made(CAP, {"remanent": {"flux_density": "60 mT"}}, {"hall": {"position": [0, 0, 19 * MM]}}, symmetry="none",
+    here = made(CAP, {"remanent": {"flux_density": "60 mT"}},
+                {"hall": {"position": [0, 0, 19 * MM]}}, symmetry="none",
                 mesh={"degree": 2, "size": 0.3})  # fmt: skip
     r0 = here.model.r0.x.array.reshape(-1, 3)
     moved = np.zeros_like(r0)

@@ -19,7 +19,8 @@ from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.public import follow
 
 MM = 1e-3
-BLOCK = {"geometry": "strip", "radius": "20 mm", "width": 0.5, "thickness": "2 mm", "youngs_modulus": "1 MPa",
+BLOCK = {"geometry": "strip", "radius": "20 mm", "width": 0.5, "thickness": "2 mm",
+         "youngs_modulus": "1 MPa",
          "poisson_ratio": 0.3}  # fmt: skip
 HALF = np.array([10.0, 5.0, 1.0]) * MM
 PLACES = (
@@ -158,18 +159,21 @@ def turned(F: np.ndarray) -> np.ndarray:
     [
         (
             {"remanent": VARIED},
-            lambda X, F: np.einsum("...ij,...j->...i", F, np.stack([1 + X[..., 0], X[..., 1], X[..., 2] * X[..., 0]
-                                                                    + X[..., 0] ** 2], axis=-1)),
+            lambda X, F: np.einsum("...ij,...j->...i", F,
+                                   np.stack([1 + X[..., 0], X[..., 1],
+                                             X[..., 2] * X[..., 0] + X[..., 0] ** 2], axis=-1)),
             1e-8,
         ),
         (
             {"remanent": VARIED, "remanence": "rotation"},
-            lambda X, F: np.einsum("...ij,...j->...i", turned(F), np.stack([1 + X[..., 0], X[..., 1], X[..., 2]
-                                                                            * X[..., 0] + X[..., 0] ** 2], axis=-1)),
+            lambda X, F: np.einsum("...ij,...j->...i", turned(F),
+                                   np.stack([1 + X[..., 0], X[..., 1],
+                                             X[..., 2] * X[..., 0] + X[..., 0] ** 2], axis=-1)),
             1e-7,
         ),
         (
-            {"remanent": {"kind": "layers", "layers": [{"fraction": 0.5, "polar": 90}, {"fraction": 0.5, "polar": 0}],
+            {"remanent": {"kind": "layers",
+                          "layers": [{"fraction": 0.5, "polar": 90}, {"fraction": 0.5, "polar": 0}],
                           "flux_density": "60 mT"}},
             lambda X, F: np.where((X[..., 2] < 0)[..., None], F[..., :, 0], F[..., :, 2]),
             1e-8,
@@ -215,7 +219,8 @@ def test_a_thin_strip_as_a_shell_and_as_a_solid() -> None:
 @cache
 def solved(law: str, e: float, polar: float = 10.0) -> tuple[Scene, Any]:
     components = [f"0.9 + {e!r}*x", f"{e!r}*x**2", f"0.1 + {e!r}*(1 - x)"]
-    magnetic = {"remanent": {"kind": "expression", "components": components, "flux_density": "60 mT"},
+    magnetic = {"remanent": {"kind": "expression", "components": components,
+                             "flux_density": "60 mT"},
                 "applied": {"polar": polar, "flux_density": "1 mT"}, "remanence": law}  # fmt: skip
     scene = made(magnetic, np.array([[18, 1, -4]]) * MM, mesh={"refinement": 0.3})
     *_, last = follow(scene)
@@ -240,7 +245,8 @@ def test_gradient_of_a_reading(law: str) -> None:
 
 
 def test_a_sensor_in_a_solid_is_refused() -> None:
-    given = {"shell": BLOCK, "boundary": {"root": "clamped"}, "model": "solid", "loading": {"kind": "field"},
+    given = {"shell": BLOCK, "boundary": {"root": "clamped"}, "model": "solid",
+             "loading": {"kind": "field"},
              "magnetic": {"remanent": TILTED, "applied": {"flux_density": "1 mT"}},
              "sensors": {"hall": {"position": ["10 mm", 0, "0.9 mm"]}}}  # fmt: skip
     with pytest.raises(CaseError, match=r"sensors\.hall\.position: .* is in the shell"):

@@ -264,7 +264,8 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
 
 
 CAP = """
-shell: {geometry: cap, radius: 25 mm, thickness: 1.2 mm, polar: 60, youngs_modulus: 0.3 MPa, poisson_ratio: 0.49}
+shell: {geometry: cap, radius: 25 mm, thickness: 1.2 mm, polar: 60, youngs_modulus: 0.3 MPa, \
+poisson_ratio: 0.49}
 boundary: {rim: clamped}
 magnetic: {remanent: {polar: 0, flux_density: 150 mT}, interaction: all}
 loading: {kind: pressure, control: load, points: 1, pressure: 100 Pa, until: target}
@@ -284,7 +285,8 @@ comm, r0 = MPI.COMM_WORLD, scene.model.r0.x.array[: system.size].reshape(-1, 3)
 x, y, _ = r0.T
 bend = np.column_stack([x * y**2, 0 * x, 0.5 - x**2])
 turn = np.column_stack([0.2 - y**2, y * x, x * y**2])
-states = [system.zero_at_supports(each.ravel()) for each in (0 * bend, 1e-2 * bend, 1.3e-2 * bend + 1e-3 * turn)]
+shapes = (0 * bend, 1e-2 * bend, 1.3e-2 * bend + 1e-3 * turn)
+states = [system.zero_at_supports(each.ravel()) for each in shapes]
 exact = [system.residual(u, mu) for u in states[:2]]
 system.tangent(states[1], mu, inexact=True)
 foreseen = system.residual(states[2], mu, inexact=True)

@@ -59,7 +59,8 @@ def made(
 
 LEFT, SIZED = {"left": "clamped"}, {"mesh": {"degree": 2, "size": 0.015}}
 KINDS = {
-    "uniform, turned": lambda: made(PLATE, LEFT, {"susceptibility": 2, "applied": FIELD}, loading=TURNED, **SIZED),
+    "uniform, turned": lambda: made(PLATE, LEFT, {"susceptibility": 2, "applied": FIELD},
+                                    loading=TURNED, **SIZED),
     "graded, by formula, with remanence": lambda: made(
         PLATE, LEFT, {"susceptibility": "2 + x", "remanent": REMANENT, "applied": G}, **SIZED
     ),
@@ -68,34 +69,40 @@ KINDS = {
         loading=MOVED, **SIZED,
     ),
     "half, thickness": lambda: made(
-        {**STRIP, "thickness_factor": "1 + x/2"}, {"root": "clamped"}, {"susceptibility": 2, "applied": FIELD},
-        symmetry="half",
+        {**STRIP, "thickness_factor": "1 + x/2"}, {"root": "clamped"},
+        {"susceptibility": 2, "applied": FIELD}, symmetry="half",
     ),
     "meridian, sources": lambda: made(
-        RING, {"inner": "clamped"}, {"susceptibility": "1 + z + x**2 + y**2",
-                                     "applied": {"sources": [{**MAGNET, "position": [0, 0, -0.02]}]}},
+        RING, {"inner": "clamped"},
+        {"susceptibility": "1 + z + x**2 + y**2",
+         "applied": {"sources": [{**MAGNET, "position": [0, 0, -0.02]}]}},
         symmetry="axisymmetric", loading=[MOVED[0], MOVED[3]],
     ),
     "solid, graded": lambda: made(
-        PLATE, LEFT, {"susceptibility": 2, "remanent": REMANENT, "applied": G}, model="solid", mesh={"size": 0.015}
+        PLATE, LEFT, {"susceptibility": 2, "remanent": REMANENT, "applied": G}, model="solid",
+        mesh={"size": 0.015}
     ),
     "solid, turned": lambda: made(
-        PLATE, LEFT, {"susceptibility": "1 + x", "applied": FIELD}, model="solid", loading=TURNED, mesh={"size": 0.015}
+        PLATE, LEFT, {"susceptibility": "1 + x", "applied": FIELD}, model="solid", loading=TURNED,
+        mesh={"size": 0.015}
     ),
     "saturating": lambda: made(
-        PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "applied": FIELD}, loading=TURNED, **SIZED
+        PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "applied": FIELD}, loading=TURNED,
+        **SIZED
     ),
     "half, saturating, by formula, thickness": lambda: made(
         {**STRIP, "thickness_factor": "1 + x/2"}, {"root": "clamped"},
         {"susceptibility": "2 + x", "saturation": "0.5 T", "applied": FIELD}, symmetry="half",
     ),
     "meridian, saturating, sources": lambda: made(
-        RING, {"inner": "clamped"}, {"susceptibility": 2, "saturation": "0.1 T",
-                                     "applied": {"sources": [{**MAGNET, "position": [0, 0, -0.02]}]}},
+        RING, {"inner": "clamped"},
+        {"susceptibility": 2, "saturation": "0.1 T",
+         "applied": {"sources": [{**MAGNET, "position": [0, 0, -0.02]}]}},
         symmetry="axisymmetric", loading=[MOVED[0], MOVED[3]],
     ),
     "solid, saturating": lambda: made(
-        PLATE, LEFT, {"susceptibility": 2, "saturation": "0.5 T", "remanent": REMANENT, "applied": G},
+        PLATE, LEFT,
+        {"susceptibility": 2, "saturation": "0.5 T", "remanent": REMANENT, "applied": G},
         model="solid", mesh={"size": 0.015},
     ),
 }  # fmt: skip

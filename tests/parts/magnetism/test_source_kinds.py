@@ -50,12 +50,15 @@ KINDS = {
     "sphere": ({"diameter": "20 mm", **POLARIZATION},
                magpylib.magnet.Sphere(diameter=20e-3, polarization=J, **SIDE)),
     "ring": ({"diameter": "20 mm", "inner_diameter": "8 mm", "height": "10 mm", **POLARIZATION},
-             magpylib.magnet.CylinderSegment(dimension=(4e-3, 10e-3, 10e-3, 0, 360), polarization=J, **SIDE)),
+             magpylib.magnet.CylinderSegment(dimension=(4e-3, 10e-3, 10e-3, 0, 360), polarization=J,
+                                             **SIDE)),
     "coil": ({"diameter": "20 mm", "current": "5 A", "turns": 100},
              magpylib.current.Circle(diameter=20e-3, current=500, **SIDE)),
-    "wire": ({"vertices": [[0, 0, 0], [0.02, 0, 0], [0.02, 0.03, 0.01], [0, 0, 0]], "current": "5 A"},
-             magpylib.current.Polyline(current=5, vertices=[[0, 0, 0], [0.02, 0, 0], [0.02, 0.03, 0.01], [0, 0, 0]],
-                                       **SIDE)),
+    "wire": ({"vertices": [[0, 0, 0], [0.02, 0, 0], [0.02, 0.03, 0.01], [0, 0, 0]],
+              "current": "5 A"},
+             magpylib.current.Polyline(
+                 current=5, vertices=[[0, 0, 0], [0.02, 0, 0], [0.02, 0.03, 0.01], [0, 0, 0]],
+                 **SIDE)),
 }  # fmt: skip
 RANDOM = np.random.default_rng(5).uniform([0, -0.2, -0.3], [1.0, 0.2, 0.5], (40, 3))  # over R
 
@@ -153,7 +156,7 @@ FIELD, SLOPE = np.array([3.0, 0.0, 4.0]), np.array([[6.0, 0, 2], [0, 1, 0], [2, 
 @pytest.mark.telling
 @pytest.mark.parametrize(("form", "slope"), [("csv", False), ("npz", True), ("vtr", True)])
 def test_grid_of_a_built_in_field(form: str, slope: bool, tmp_path: Path) -> None:
-    """A uniform field, and a constant gradient: the deflection is that of the built-in one to 1e-6."""
+    """A uniform field, and a constant gradient. The deflection is the built-in one's to 1e-6."""
     file = written(tmp_path, form, FIELD, slope * SLOPE)
     grid = case([{"kind": "grid", "file": file}], tmp_path, loading={"kind": "field", "points": 1})
     polar = float(np.degrees(np.arctan2(3, 4)))

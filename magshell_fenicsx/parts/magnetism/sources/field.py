@@ -186,7 +186,7 @@ def _moving_source(
     number
         Number of the source in the list of sources.
     rotations
-        Rotations of the whole field, see `turns`.
+        Rotations of the whole field about the origin, one for each step that rotates it.
     Q
         Rotation (3, 3) from the frame of the case to that of the model.
     """

@@ -38,7 +38,8 @@ Polarization = (
 )
 Current = Annotated[float, or_number("ampere"), Field(ge=-1e9, le=1e9)]
 SourceName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
-STEP, DEGREE = 0.005, 5  # see `Harmonic`
+# of `Harmonic`: step over the distance from the source, and degree of the harmonic polynomials
+STEP, DEGREE = 0.005, 5
 
 
 @dataclass(frozen=True)
