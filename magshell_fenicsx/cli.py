@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from magshell_fenicsx import __version__, inspection
 from magshell_fenicsx.command import (
+    INTERRUPTED,
     INVALID,
     STOPPED,
     CaseFile,
@@ -94,6 +95,8 @@ def main() -> None:
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception as e:
+        if _was_interrupted(e):
+            sys.exit(INTERRUPTED)
         if isinstance(e, ImportError) and (advice := install_hint(e)):
             print(advice, file=sys.stderr)
             sys.exit(INVALID)
@@ -104,6 +107,16 @@ def main() -> None:
         traceback.print_exc()
         sys.stderr.flush()
         world().Abort(1)  # the other ranks would wait for this one for ever
+
+
+def _was_interrupted(error: BaseException) -> bool:
+    """Return whether an error was caused by KeyboardInterrupt.
+
+    An interrupt within a function that PETSc calls ends PETSc's solve with an error of its own,
+    whose cause it is.
+    """
+    cause = error.__cause__
+    return cause is not None and (isinstance(cause, KeyboardInterrupt) or _was_interrupted(cause))
 
 
 def _print_version(requested: bool) -> None:

@@ -148,6 +148,32 @@ cli.main()
     assert "AssertionError: a bug" in done.stderr
 
 
+def test_an_interrupt_within_a_solve_of_petsc() -> None:
+    """PETSc's error hides it; the program ends as after any other interrupt."""
+    program = """
+from petsc4py import PETSc
+from magshell_fenicsx import cli
+class Interrupted:
+    def mult(self, A, x, y):
+        raise KeyboardInterrupt
+def app(**_):
+    A = PETSc.Mat().createPython((2, 2), Interrupted())
+    A.setUp()
+    x, b = A.createVecs()
+    b.set(1.0)
+    ksp = PETSc.KSP().create()
+    ksp.setOperators(A)
+    ksp.pc.setType("none")
+    ksp.solve(b, x)
+cli.app = app
+cli.main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_missing_file_and_no_case() -> None:
     done = magshell("run", "nowhere.yaml")
     assert (done.returncode, done.stderr) == (

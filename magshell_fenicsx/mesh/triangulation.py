@@ -8,6 +8,7 @@ their nodes have one representative. Lengths are those of the chart, over R.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,7 @@ def _gmsh_mesh(
         If gmsh cannot mesh the shape.
     """
     gmsh = import_gmsh()
+    element_size = _ElementSize(size)
 
     # ~/.gmshrc may change meshes, and run commands
     gmsh.initialize(readConfigFiles=False, interruptible=False)
@@ -115,12 +117,15 @@ def _gmsh_mesh(
         # some sizes vary so much along a curve that gmsh must integrate them more precisely
         if precision := getattr(size, "precision", None):
             gmsh.option.setNumber("Mesh.LcIntegrationPrecision", precision)
-        gmsh.model.mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: size(np.array([x, y])))
+        gmsh.model.mesh.setSizeCallback(element_size)
         gmsh.model.mesh.generate(2)
+        if element_size.error:
+            raise element_size.error
         gmsh.model.mesh.setOrder(ORDER)
         nodes, cells, lines = _nodes_and_elements(gmsh.model)
     except Exception as e:  # gmsh's own errors have no class of their own
-        raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
+        message = f"gmsh cannot mesh this surface: {e}"
+        raise (element_size.error or MeshError(message)) from None
     finally:
         gmsh.finalize()
     # at a curved edge gmsh's inner node is a little off, which costs an order of convergence in the
@@ -128,6 +133,34 @@ def _gmsh_mesh(
     # Numer. Anal. 23, 1986)
     nodes[cells[:, 9]] = nodes[cells[:, 3:9]].sum(axis=1) / 4 - nodes[cells[:, :3]].sum(axis=1) / 6
     return nodes, cells, lines
+
+
+class _ElementSize:
+    """Element size at a place, as gmsh asks for it.
+
+    gmsh ignores an exception in a function that it calls, and takes the size 0 there. The first
+    exception is therefore kept, and large elements then end the triangulation soon.
+
+    Attributes
+    ----------
+    error
+        The first exception, an interrupt included; None if there is none.
+    """
+
+    def __init__(self, size: Size):
+        self._size = size
+        self.error: BaseException | None = None
+
+    def __call__(
+        self, dim: int, tag: int, x: float, y: float, z: float, default_size: float
+    ) -> float:
+        """Return the element size at (x, y) in the chart; the other arguments are not used."""
+        if self.error is None:
+            try:
+                return self._size(np.array([x, y]))
+            except BaseException as e:
+                self.error = e
+        return inf
 
 
 def _halved_at(size: Size, places: Array) -> Size:

@@ -8,6 +8,7 @@ import ufl
 from conftest import hemisphere
 from dolfinx import fem
 from mpi4py import MPI
+from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
@@ -21,6 +22,19 @@ def patch(size: float = 0.5) -> PatchMesh:
     return triangulate(
         DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, plane_embedding
     )
+
+
+def test_an_interrupt_while_gmsh_asks_for_a_size() -> None:
+    """It ends the triangulation; gmsh alone would ignore it and take the size 0 there."""
+    sizes = iter([0.5] * 20)
+
+    def size(place: NDArray[np.float64]) -> float:
+        for value in sizes:
+            return value
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        triangulate(DiscShape(1.0, half=False), size, {}, plane_embedding)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
