@@ -22,7 +22,7 @@ from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFea
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import SizingContext
-from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.parts.supports.boundary import RUBBER_EDGE_SIZE, BoundarySection
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 if TYPE_CHECKING:
@@ -34,6 +34,8 @@ SOLID_DEGREE = 2
 MAX_SIZE = 0.35  # over R, where nothing needs smaller elements
 UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the largest of grids
 MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
+MIN_RUBBER_EDGE_SIZE = 0.014  # over R: at clamped edges of inflated rubber that is very thin
+RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
 EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
 GROWTH = 0.4  # of the size per distance
 
@@ -192,11 +194,14 @@ def _growth(context: Context, sizing: SizingContext) -> float:
 def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
     """Return small elements along held edges of a grid, or along the rim of a curved disc.
 
-    A curved disc is the chart of a sphere, for example. Flat shapes have none.
+    A curved disc is the chart of a sphere, for example. Flat shapes have none, but for clamped
+    edges of inflated rubber, where sizes do not depend on the refinement.
     """
     h, growth = sizing.h, _growth(context, sizing)
+    boundary = context.section_of(BoundarySection)
+    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary else []
+    rubber_size = max(RUBBER_EDGE_SIZE * h, MIN_RUBBER_EDGE_SIZE)
     if grid := outline.grid:
-        boundary = context.section_of(BoundarySection)
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()
@@ -206,9 +211,13 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
             is_held = conditions.get(name, "free") not in ("free", "symmetry")
             if is_held and not grid.glued[axis]:
                 features.append(LineFeature(axis, corner[axis], size, growth))
+            if name in rubber_edges:
+                features.append(LineFeature(axis, corner[axis], rubber_size, RUBBER_GROWTH))
         return features
-    if not outline.disc or context.shell.geometry == "disc":
+    if not outline.disc:
         return []
-    # of the sizes that loads allow along the rim, over sqrt(Rh), the largest
-    size = max((step.load.rim(sizing) for step in context.steps), default=EDGE_SIZE)
-    return [RingFeature(outline.edge, size * sqrt(h) / sizing.refinement, growth)]
+    features = [RingFeature(outline.edge, rubber_size, RUBBER_GROWTH)] if rubber_edges else []
+    if context.shell.geometry != "disc":
+        size = max((step.load.rim(sizing) for step in context.steps), default=EDGE_SIZE)
+        features.append(RingFeature(outline.edge, size * sqrt(h) / sizing.refinement, growth))
+    return features

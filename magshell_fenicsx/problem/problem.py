@@ -30,7 +30,7 @@ from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.mesh.unfolding import double_sector
 from magshell_fenicsx.mesh.vertex_spacing import flat_triangle, refuse_flat
-from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
+from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, with_cell_at_edge
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -41,6 +41,7 @@ from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.supports.boundary import RUBBER_EDGE_CELL, BoundarySection
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (
     FrequenciesSection,
@@ -473,7 +474,7 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         contact_cells = contact_reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
     # the thickness, or a smaller size of cells on the axis that resolves the contact of a body
     size_on_axis = min([h, *(size / CELLS_OF_CONTACT for size, _ in problem.body_contacts)])
-    return graded_vertices(
+    vertices = graded_vertices(
         meridian.length,
         meridian.curvature_jumps,
         size_on_axis,
@@ -484,6 +485,13 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         # the size that the case gives for all cells, over R; None without
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
+    boundary = problem.context.section_of(BoundarySection)
+    rubber_edges = boundary.edges_of_inflated_rubber(problem.context) if boundary else []
+    ends = zip((0.0, meridian.length), (meridian.names[0], meridian.names[-1]), strict=True)
+    for end, name in ends:
+        if name in rubber_edges:
+            vertices = with_cell_at_edge(vertices, end, RUBBER_EDGE_CELL * problem.material.h)
+    return vertices
 
 
 def _vertices_of_shells(problem: Problem, meridian: MeridianChart) -> NDArray[np.float64]:

@@ -326,7 +326,7 @@ class ResultSampler:
         change
             Whether values are changes since the step began.
         """
-        _, first_row = self._observed[0]
+        first_row = self._observed[0][1] if change else {}
         at_begin = float(first_row[column]) if change else 0.0
         return [(place, float(row[column]) - at_begin) for place, row in self._observed]
 

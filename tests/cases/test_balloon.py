@@ -21,7 +21,6 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq, fsolve
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.public import run
 
 Numbers = np.ndarray
@@ -107,23 +106,6 @@ def test_flat_disc(share: float) -> None:
     for height, stretch in ((0.5, 1.2), (1.0, 1.8), (1.5, 3.0 if not share else 2.6)):
         p = float(pressure(height))
         assert p == pytest.approx(membrane.pressure(height, (stretch, p)), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("settings", "warned"),
-    [
-        ([], True),
-        (["boundary.rim=hinged"], False),
-        (["shell.thickness=0.1 mm"], False),
-        (["shell.law=koiter"], False),
-    ],
-)
-def test_warning_of_a_clamped_rim(settings: list[str], warned: bool) -> None:
-    """An axisymmetric solid of R/h = 50 has its fold 0.6 % above a membrane's; here it may be a
-    fourth below.
-    """
-    said = make_problem(Case.load(CASES / "balloon.yaml", settings)).warnings
-    assert any(each.startswith("boundary.rim: clamped: blown-up rubber") for each in said) == warned
 
 
 @pytest.mark.slow
@@ -308,8 +290,7 @@ def test_models_of_a_balloon() -> None:
     settings.append("loading.volume_change=600000 mm^3")
     p, volume = list[float](), list[float]()
     for symmetry in ("axisymmetric", "half", "none"):
-        mesh = [] if symmetry == "axisymmetric" else ["mesh={degree: 3, size: 12 mm}"]
-        found = run(Case.load(CASES / "balloon.yaml", [*settings, *mesh, f"symmetry={symmetry}"]))
+        found = run(Case.load(CASES / "balloon.yaml", [*settings, f"symmetry={symmetry}"]))
         (fold,) = [row for row in found.rows if row["label"] == "fold"]
         p.append(float(fold["p_over_pc"]))
         volume.append(float(fold["volume_change"]))

@@ -349,6 +349,20 @@ def graded_vertices(
     return _equidistributed(corners, size)
 
 
+def with_cell_at_edge(vertices: Array, edge: float, width: float) -> Array:
+    """Return vertices (n,) of a meridian with one cell of a given width at one of its ends.
+
+    Vertices within 1.5 times the width of the end `edge` are left out. A meridian that is shorter
+    than three cells of this width stays as it is.
+    """
+    first, last = vertices[[0, -1]]
+    if last - first < 3 * width:
+        return vertices
+    inner_end = first + width if edge == first else last - width
+    outside = vertices[np.abs(vertices - edge) > 1.5 * width]
+    return np.sort([*outside, inner_end, edge])
+
+
 @dataclass(frozen=True)
 class _CellSize:
     """The wanted size of cells along a meridian: the least that any feature asks for.

@@ -202,13 +202,17 @@ def clamped(
     The side '-' is rigid: its normal stays n0, or is `turn` n0 with a rotation (3, 3). There are
     jets, covector, law and natural forms of one side only; `width` is that of its cells, `sigma`
     the penalty.
+
+    The penalty has the stiffness of small strains. That of rubber falls with the stretch: an edge
+    that stretched by itself would turn freely.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
     # the jump -[n] . r_nu from the held normal to that of the shell
     held_normal = n0 if turn is None else ufl.dot(turn, n0)
     J = -ufl.dot(held_normal - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
+    M, _ = densities.normal_moment(r0, u, nu1, nu2, law, natural)
+    _, D = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 
 

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-THIN_RUBBER = 200  # R/h beyond which a clamped edge counts less than the mesh
+# over the thickness: sides of triangles at a clamped edge of inflated rubber, and the cell of a
+# meridian there; docs/theory.md, Rubber
+RUBBER_EDGE_SIZE, RUBBER_EDGE_CELL = 1.0, 1.4
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
 EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
@@ -91,21 +93,26 @@ class BoundarySection(Section, Ability):
         """Return name of each edge, point or patch -> its condition."""
         return dict(self.__pydantic_extra__ or {})
 
-    def warning(self, context: Context, places: Array) -> str | None:
-        """Return a warning if pressure blows up thick rubber beside a clamped edge; None if not.
+    def edges_of_inflated_rubber(self, context: Context) -> list[str]:
+        """Return names of clamped edges at which rubber under pressure bends in a narrow layer."""
+        is_inflated = any(step.kind == "pressure" for step in context.steps)
+        if getattr(context.shell, "rubber", None) is None or not is_inflated:
+            return []
+        return [name for name, condition in self.conditions().items() if condition == "clamped"]
 
-        No shell theory holds in the layer at such an edge. `places` are not used here.
+    def warning(self, context: Context, places: Array) -> str | None:
+        """Return a warning if elements of the wrong size may stand at clamped, inflated rubber.
+
+        Those of a mesh file and of a strip are not chosen for it. None if there is nothing to warn
+        of. `places` are not used here.
         """
-        clamped = [name for name, condition in self.conditions().items() if condition == "clamped"]
-        blown_up = any(step.kind == "pressure" for step in context.steps)
-        is_rubber = getattr(context.shell, "rubber", None) is not None
-        if not (clamped and blown_up and is_rubber) or context.shell.R_over_h > THIN_RUBBER:
+        edges = self.edges_of_inflated_rubber(context)
+        if not edges or context.shell.geometry not in ("mesh", "strip"):
             return None
         return (
-            f"boundary.{clamped[0]}: clamped: blown-up rubber bends there in a layer as wide as "
-            "it is thick, in which no shell theory holds: its fold may come too low, by up to a "
-            "fourth, and modes at the edge are none of the shell; hinged is right, and a clamped "
-            "edge raises the fold by less than h/R"
+            f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
+            "is thick: elements along this edge must be as wide, or instabilities may be false; "
+            "hinged is right with any, and a clamped edge raises the fold by less than h/R"
         )
 
     def refuse_unfit(self, context: Context) -> None:
