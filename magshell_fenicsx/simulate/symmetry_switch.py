@@ -405,7 +405,7 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
     state = switch.stage.point(switch.point).state
     # columns of the results at the bifurcation, in both models
     old_row, new_row = old.observe(event.point.state), new_scene.observe(state)
-    old_load, new_load = amount_of(old, name, event.point.state), amount_of(new_scene, name, state)
+    old_load, new_load = amount_of(name, event.point.state), amount_of(name, state)
     # relative changes of load and energy, and the change of w/h
     load_change = abs(new_load - old_load) / max(abs(old_load), TINY)
     old_energy = old_row["energy"]
@@ -425,11 +425,8 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
     )
 
 
-def amount_of(scene: Scene, name: str, state: State) -> float:
-    """Return the value of an amplitude at a state; lambda_m of a step that drives several.
-
-    The scene is not used here.
-    """
+def amount_of(name: str, state: State) -> float:
+    """Return the value of an amplitude at a state; lambda_m of a step that drives several."""
     return state.mu.get(name, state.mu.get("lambda_m", 0.0))
 
 

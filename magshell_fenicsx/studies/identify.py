@@ -659,9 +659,7 @@ def _write(
         Draws the picture into a file.
     """
     for programme_of_case in programmes:
-        prediction = programme_of_case.prediction(
-            folder, identified.fit, identified.content["noise"]
-        )
+        prediction = programme_of_case.prediction(folder, identified.content["noise"])
         identified.content["programmes"][programme_of_case.name] = prediction.content
         identified.content["said"] += prediction.said  # sentences that are printed at the end
         prediction.write(folder)

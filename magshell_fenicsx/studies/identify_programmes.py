@@ -268,17 +268,13 @@ class Programme:
         has_needed = not outcome.curve or self._needed_columns.keys() <= outcome.curve[0].keys()
         return outcome if has_needed else None
 
-    def prediction(
-        self, folder: Path, posterior: Posterior, noise: Mapping[str, Mapping[str, Any]]
-    ) -> Prediction:
+    def prediction(self, folder: Path, noise: Mapping[str, Mapping[str, Any]]) -> Prediction:
         """Return the prediction with its bands from the stored runs.
 
         Parameters
         ----------
         folder
             Folder of the identification.
-        posterior
-            Not used here: the runs for drawn parameters stand for it.
         noise
             Column -> its noise, as in identify.json; `deviation` is the standard deviation.
 

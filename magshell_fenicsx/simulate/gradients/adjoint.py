@@ -499,7 +499,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                 scene, step, place.state, state_before, held_conjugates
             )
         # and by loads that were unknowns there, as their conjugates were held
-        for name in loads.keys() & held_before.keys():
+        for name in sorted(loads.keys() & held_before.keys()):
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
         if place and held_conjugates:
@@ -540,7 +540,8 @@ def _add_kept_loads(
     """
     place, *_ = newest_adjoint.places
     reused_amplitudes = _amplitudes_of_steps(earlier_steps) & place.state.mu.keys()
-    for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
+    # in the same order on all ranks
+    for name in sorted(reused_amplitudes - place.rows.keys() - driven_amplitudes):
         loads[name] = loads.get(name, 0.0) + by_load(newest_adjoint, name)
 
 

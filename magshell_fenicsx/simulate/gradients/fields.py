@@ -348,7 +348,8 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
     ]
     shares += _shares_of_parameters(scene, place, name)
     # a held conjugate is a fixed multiple of its unit, which depends on the size of the shell
-    for held_amplitude in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:
+    held_amplitudes = place.rows.keys() & scene.model.load_sizes.keys() - place.follows
+    for held_amplitude in sorted(held_amplitudes):  # in the same order on all ranks
         weight_of_size = (
             -c[held_amplitude]
             * scene.model.system.potential(place.state.u, mu, held_amplitude)
@@ -421,7 +422,8 @@ def _shares_of_parameters(scene: Scene, place: AdjointState, name: str) -> list[
         If such a derivative has no form.
     """
     system, conjugates, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
-    for parameter in conjugates.keys() & system.parameters.keys():
+    # in the same order on all ranks
+    for parameter in sorted(conjugates.keys() & system.parameters.keys()):
         for derivative in system.parameters[parameter].slopes:
             # a density is known at points; its form can be differentiated
             if isinstance(derivative, ParameterDerivative) and not derivative.density.on_edges:
