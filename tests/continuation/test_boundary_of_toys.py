@@ -293,7 +293,9 @@ def test_the_first_of_three_modes_that_meet_is_followed(
         monkeypatch.setattr(
             Boundary,
             "_locate_meeting",
-            lambda self, *args: None if args[-1] == 3 else meeting(self, *args),
+            lambda self, *args, family=0, **others: (
+                None if family == 3 else meeting(self, *args, family=family, **others)
+            ),
         )
 
     def curve(m: int, *_: object) -> Boundary:
