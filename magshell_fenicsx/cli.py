@@ -116,7 +116,9 @@ def _was_interrupted(error: BaseException) -> bool:
     whose cause it is.
     """
     cause = error.__cause__
-    return cause is not None and (isinstance(cause, KeyboardInterrupt) or _was_interrupted(cause))
+    if cause is None:
+        return False
+    return isinstance(cause, KeyboardInterrupt) or _was_interrupted(cause)
 
 
 def _print_version(requested: bool) -> None:

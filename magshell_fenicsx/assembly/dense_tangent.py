@@ -378,11 +378,7 @@ class DenseTangent:
         # the latest ones serve for the same blocks and the same pattern, which contact changes
         if self._latest_common is not None:
             latest_blocks, common = self._latest_common
-            if (
-                latest_blocks is part.near_blocks
-                and np.array_equal(common.indices, columns)
-                and np.array_equal(common.indptr, starts)
-            ):
+            if latest_blocks is part.near_blocks and _has_pattern(common, starts, columns):
                 return common
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))  # of each entry
         own_fixed, all_fixed = self.fixed
@@ -562,6 +558,11 @@ def _row_starts(rows: int, width: int) -> NDArray[np.generic]:
     if width == 0:
         return np.zeros(rows + 1, dtype=PETSc.IntType)
     return np.arange(0, rows * width + 1, width, dtype=PETSc.IntType)
+
+
+def _has_pattern(matrix: csr_array, starts: NDArray[np.intp], columns: NDArray[np.intp]) -> bool:
+    """Return whether a matrix has a pattern of compressed sparse rows."""
+    return np.array_equal(matrix.indices, columns) and np.array_equal(matrix.indptr, starts)
 
 
 def _entries(blocks: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:

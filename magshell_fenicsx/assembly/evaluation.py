@@ -93,8 +93,8 @@ class Evaluation:
         system, mu = self._system_at_state, self._mu
         potentials = {t.name: float(system.comm.allreduce(t.energy())) for t in system.terms}
         # with amplitudes supports move, and lids sweep a volume
-        pressure = system.edge_pressure
-        if mu and pressure and pressure.load in potentials:
+        pressure = system.edge_pressure if mu else None
+        if pressure and pressure.load in potentials:
             potentials[pressure.load] += system.lid_potential(mu, pressure.load)
         return potentials
 
@@ -209,8 +209,9 @@ class Evaluation:
         system, mu = self._system_at_state, self._mu
         local = system._gradient({name: 1.0} if name else system._factors(mu))
         # the live pressure acts on moving edges, too
-        if system.moving and system.edge_pressure and not name:
-            pressure = mu.get(system.edge_pressure.load, 0.0)
+        edge_pressure = None if name else system.edge_pressure
+        if system.moving and edge_pressure:
+            pressure = mu.get(edge_pressure.load, 0.0)
             local += pressure * system.moving.edge_forces(system.u.x.array)
         return system._summed(local, constrained=False)
 
@@ -240,8 +241,9 @@ class Evaluation:
         """
         system = self._system_at_state
         column = system._column(self._mu, name)
-        pressure = system.edge_pressure
-        if system.moving and pressure and name == pressure.load and not constrained:
+        edge_pressure = None if constrained else system.edge_pressure
+        acts_on_edges = edge_pressure and name == edge_pressure.load
+        if system.moving and acts_on_edges:
             column += system.moving.edge_forces(system.u.x.array)
         return system._summed(column, constrained=constrained)
 

@@ -550,7 +550,7 @@ class FiniteElementSystem:
         N = self._skew(factors)  # None if all loads have a potential
         if self.dense_terms:
             K = self._corrected(K, self.dense_terms, factors, inexact=inexact)
-            if N or self.projection or self.noise:  # these need all entries of K + D
+            if any((N, self.projection, self.noise)):  # these need all entries of K + D
                 K = symmetric_part(K)
         if self.projection:
             K = self.projection.tangent(K)
@@ -685,9 +685,11 @@ class FiniteElementSystem:
                 self.gradients.add(b, factors)
             weighted = [(factors.get(t.name, 0.0), t) for t in self._terms_with_residual]
             for factor, term in itertools.chain(weighted, further):
-                if factor and inexact and isinstance(term, DenseTerm):
+                if not factor:
+                    continue
+                if inexact and isinstance(term, DenseTerm):
                     term.add_extrapolated_residual(b, factor)
-                elif factor:
+                else:
                     term.add_residual(b, factor)
             return b
 

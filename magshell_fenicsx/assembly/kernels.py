@@ -106,7 +106,9 @@ class DerivedForm:
         on `u`.
         """
         origin = self.origin
-        if not isinstance(origin, ufl.Form) or origin.empty() or len(origin.ufl_domains()) != 1:
+        if not isinstance(origin, ufl.Form) or origin.empty():
+            return None
+        if len(origin.ufl_domains()) != 1:
             return None
         if self.u is None:
             return origin.signature(), self.derivation, -1  # no position

@@ -259,10 +259,11 @@ class NonlocalEntries:
         factor in `factors` is zero do not count.
         """
         keys = tuple((t.name, t.pattern_key) for t in self._terms if factors.get(t.name, 0.0))
-        if self._sum is None or self._pattern_keys != keys or self._sum.sparse.handle != K.handle:
-            self._sum = _MatrixSum(K, self._expected_pattern(factors), self._own.start)
-            self._pattern_keys = keys
-        return self._sum
+        matrix_sum = self._sum if self._pattern_keys == keys else None
+        if matrix_sum is None or matrix_sum.sparse.handle != K.handle:
+            matrix_sum = _MatrixSum(K, self._expected_pattern(factors), self._own.start)
+            self._sum, self._pattern_keys = matrix_sum, keys
+        return matrix_sum
 
     def times(self, v: Array, factors: Factors) -> Array:
         """Return this rank's part of the tangents' product with v, both with ghosts. Collective.
@@ -429,7 +430,10 @@ def _owned_rows(
     if comm.size > 1:
         # the last rank whose first unknown is not beyond the row
         owner = np.searchsorted(ranges, selected[0], side="right") - 1
-        sent = [tuple(array[owner == rank] for array in selected) for rank in range(comm.size)]
+        sent = list[tuple[Any, ...]]()
+        for rank in range(comm.size):
+            is_of_rank = owner == rank
+            sent.append(tuple(array[is_of_rank] for array in selected))
         received = comm.alltoall(sent)
         selected = tuple(np.concatenate(arrays) for arrays in zip(*received, strict=True))
     own_rows, own_columns, own_values = selected

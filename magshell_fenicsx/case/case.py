@@ -264,7 +264,8 @@ class Case(WithParts):
         """Check that shell or solid, mesh and symmetry go together."""
         is_mesh_file = isinstance(self.shell, MeshSurface)
         size_keys = sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"})
-        if size_keys and is_mesh_file and not self.several:
+        is_one_mesh_file = is_mesh_file and not self.several
+        if size_keys and is_one_mesh_file:
             raise ValueError(
                 f"mesh.{size_keys[0]}: not with geometry: mesh, whose elements are those of the "
                 "file"

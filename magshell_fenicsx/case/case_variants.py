@@ -77,7 +77,9 @@ def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
     """
     readers = case.readers
     # nothing to do on one rank, or where an earlier call has shared the files
-    if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
+    if comm.size == 1:
+        return case
+    if readers and all(reader.files.shared for reader in readers.values()):
         return case
     # the case of rank 0 as text, and key -> content of each file as rank 0 reads it
     case_json = case.model_dump_json()

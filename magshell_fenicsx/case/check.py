@@ -93,7 +93,9 @@ def _refuse_unsupported(problem: Problem) -> None:
     )
     # springs may be among user-defined energies: a run finds out from its tangent matrix
     springs_may_hold = bool(problem.loads.user_terms)
-    if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
+    if not unsupported or problem.at_rest:
+        return
+    if not (problem.moves_freely or springs_may_hold):
         raise CaseError(
             "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
             + problem.support_hint

@@ -221,7 +221,7 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
         If a shell alone cannot be planned; the message begins with its key.
     """
     # for each joint the names of its two shells
-    joined_shells = [{several.shell_of(name) for name in names} for names in several.joints]
+    joined_shells = [set(map(several.shell_of, names)) for names in several.joints]
     if any(set(pair) in joined_shells for pair in several.pairs):
         return "contact: shells that are joined to each other are modelled with their circumference"
     shells = list[CoaxialShell]()

@@ -83,7 +83,7 @@ def contact_places(
     }
     all_may_touch = [WHOLE_SHELL, WHOLE_SHELL] in [[*pair] for pair in pairs]
     for a, b in all_pairs if all_may_touch else pairs:
-        if a == b or a not in places or b not in places:
+        if a == b or not {a, b} <= places.keys():
             continue
         # the gap at each place of one shell to the other, and the number of the nearest place there
         gaps_a, nearest_in_b = _gaps(places[a], places[b], half_thickness[a], half_thickness[b])
@@ -99,7 +99,7 @@ def contact_places(
             if _extent(similar, nearest_places[name]) < one_place_distance[name]:
                 with_one_place.append(name)
         # the two places were samples; charts of both shells make them exact
-        if with_one_place and a in charted and b in charted:
+        if with_one_place and {a, b} <= charted.keys():
             exact_a, exact_b = _nearest(
                 nearest_places[a], nearest_places[b], charted[a], charted[b]
             )

@@ -106,7 +106,9 @@ def _write_files(contents: dict[Path, bytes], target: Path) -> list[Path]:
     Raises CaseError before anything is written.
     """
     for path, content in contents.items():
-        if path.exists() and (path == target or path.read_bytes() != content):
+        if not path.exists():
+            continue
+        if path == target or path.read_bytes() != content:
             raise CaseError(f"{path}: is there already, and is kept; name a file elsewhere")
     for path, content in contents.items():
         if not path.exists():

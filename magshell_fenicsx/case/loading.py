@@ -102,7 +102,8 @@ def refuse_unfit_steps(context: Context) -> None:
         # a static step needs equilibrium at its begin: after a motion the shell must have come to
         # rest
         earlier_steps = context.steps_before(step.number)
-        if earlier_steps and not earlier_steps[-1].load.rests and not load.in_time:
+        begins_in_motion = bool(earlier_steps) and not earlier_steps[-1].load.rests
+        if begins_in_motion and not load.in_time:
             kind = earlier_steps[-1].kind
             raise ValueError(
                 f"{key}: begins in equilibrium: the step of kind: {kind} before it needs "
@@ -130,7 +131,8 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         key = f"{step.key}.hold.{name}"
         holds_conjugate = manner == "conjugate"
         # the step's own amplitude: its conjugate alone, on a way to an instability without an end
-        if name == step.name and not (to_limit and holds_conjugate):
+        may_hold_own = to_limit and holds_conjugate
+        if name == step.name and not may_hold_own:
             raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
         if name == step.name and step.load.limit_target:
             raise ValueError(
@@ -167,7 +169,9 @@ def _refuse_unfit_conjugate(key: str, load: Step, step: ProgrammeStep) -> None:
         )
     # `released` is the reason why a conjugate cannot be held while the shell moves; it moves in a
     # motion, and where it is released at the end of a step
-    if load.released and (step.load.in_time or step.load.released_by):
+    if not load.released:
+        return
+    if step.load.in_time or step.load.released_by:
         raise ValueError(f"{key}: conjugate: {load.released}")
 
 
@@ -190,10 +194,13 @@ def refuse_unknown_patches(
     """
     if isinstance(shell, MeshSurface):
         return
-    if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
-        raise ValueError(
-            f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file"
-        )
+    if not dimples:
+        needs_dimple = "dimple" in patches or not isinstance(shell, ShellSection)
+        if needs_dimple:
+            raise ValueError(
+                f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh "
+                "file"
+            )
     # the patches within dimples, and all of the surface outside them
     allowed = [*(dimples or ["dimple"]), "rest"]
     if unknown := set(patches) - set(allowed):

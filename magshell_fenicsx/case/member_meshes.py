@@ -278,12 +278,11 @@ class MemberMeshes:
         places_of_contact = contact_places(
             several.pairs, places, thickness, one_place_distance, charted
         )
-        return {
-            member.name: [
-                several.place(member).to_shell_frame(x) for x in places_of_contact[member.name]
-            ]
-            for member in several.parts
-        }
+        own_places = dict[str, list[Array]]()
+        for member in several.parts:
+            to_own_frame = several.place(member).to_shell_frame
+            own_places[member.name] = [to_own_frame(x) for x in places_of_contact[member.name]]
+        return own_places
 
     @property
     def _all_are_held(self) -> bool:
@@ -292,9 +291,8 @@ class MemberMeshes:
         Halves do not see motions across their plane.
         """
         is_held = {member.name: member.section.boundary.fixes for member in self._several.parts}
-        pairs = [
-            tuple(self._several.shell_of(name) for name in edges) for edges in self._several.joints
-        ]
+        shell_of = self._several.shell_of
+        pairs = [tuple(map(shell_of, edges)) for edges in self._several.joints]
         # a shell that is joined to a held one is held too. This is repeated as often as there are
         # joints, so that it reaches the end of a chain of shells
         for _ in pairs:

@@ -107,9 +107,12 @@ def modelled_part(
     is_axisymmetric = False
     if plane is None:  # whether the meridian is modelled, else the plane of a half or a sector
         is_axisymmetric, plane = _symmetry(case, outline, constraints)
+    unturned = ModelledPart(is_axisymmetric, plane, turn=0.0, mirror=plane)
+    if plane is None:
+        return unturned
     # only a surface of revolution looks the same in a turned frame
-    if plane is None or not (outline.round and plane.through_e3):
-        return ModelledPart(is_axisymmetric, plane, turn=0.0, mirror=plane)
+    if not (outline.round and plane.through_e3):
+        return unturned
     # the frame is turned by the azimuth of the plane, which becomes y = 0. Of a sector this is the
     # first of its two planes
     waves = plane.waves if isinstance(plane, Sector) else None
@@ -224,7 +227,8 @@ def _symmetry(
     reason = why_not_axisymmetric(constraints)  # None if all constraints are axisymmetric
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
-    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
+    may_be_meridian = case.symmetry in ("auto", "axisymmetric") and case.model == "shell"
+    if reason is None and may_be_meridian:
         return True, None
     # a sector for a number of waves; or all of the shell
     if isinstance(case.symmetry, int):

@@ -418,10 +418,14 @@ def _pairs(contact: Any) -> list[list[str]]:
     entries = [
         entry.get("between") if isinstance(entry, dict) else entry for entry in entries_of_contact
     ]
-    pairs = [pair for pair in entries if isinstance(pair, list | tuple)]
-    return [
-        [*pair] for pair in pairs if len(pair) == 2 and all(isinstance(name, str) for name in pair)
-    ]
+    return [[*entry] for entry in entries if _is_pair_of_names(entry)]
+
+
+def _is_pair_of_names(entry: Any) -> bool:
+    """Return whether an entry is a list of two texts."""
+    if not isinstance(entry, list | tuple):
+        return False
+    return len(entry) == 2 and all(isinstance(name, str) for name in entry)
 
 
 def _with_mesh_names(data: Any, shells: Mapping[str, Any]) -> Any:

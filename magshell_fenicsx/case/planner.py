@@ -722,14 +722,13 @@ def _contact_regions(
 
     The zone follows from the load steps that move the body, those with the name of its amplitude.
     """
-    return [
-        ContactZone.of_body(
-            contact,
-            (step.load for step in case.programme if step.name == contact.amplitude),
-            shell,
-        )
-        for contact in bodies
-    ]
+
+    def zone_of(contact: ContactBody) -> ContactZone:
+        """Return the zone in which one body presses."""
+        loads = (step.load for step in case.programme if step.name == contact.amplitude)
+        return ContactZone.of_body(contact, loads, shell)
+
+    return [zone_of(contact) for contact in bodies]
 
 
 def _size_limits(
@@ -777,14 +776,16 @@ def _shape(
     if part.sector and not is_grid:
         size = towards_tip(size, part.sector)
         shape = outline.chart(part.sector, size)
-    if isinstance(shape, Grid) and part.mirror and not part.sector:
+    mirror_of_half = None if part.sector else part.mirror
+    if isinstance(shape, Grid) and mirror_of_half:
         # the grid has lines at a point, and at its mirror image on the other half
         images = []
         for chart in points:
             place = outline.embedding(chart[None])[0]
-            images.append(outline.inverse(part.mirror.image(place)))
+            images.append(outline.inverse(mirror_of_half.image(place)))
         x_lines, y_lines = shape.movable_lines
-        x_of_images, y_of_images = ([float(image[i]) for image in images] for i in range(2))
+        x_of_images = [float(image[0]) for image in images]
+        y_of_images = [float(image[1]) for image in images]
         movable_lines = ((*x_lines, *x_of_images), (*y_lines, *y_of_images))
         shape = replace(shape, movable_lines=movable_lines)
     return shape, size

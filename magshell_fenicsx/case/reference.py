@@ -144,11 +144,8 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
         if "$ref" in part:
             rewritten_part["$ref"] = titles.get(part["$ref"], part["$ref"])
         # a section is what has keys and a title, except the case itself
-        if (
-            "properties" not in part
-            or part is schema_of_case
-            or not isinstance(part.get("title"), str)
-        ):
+        has_keys_and_title = "properties" in part and isinstance(part.get("title"), str)
+        if part is schema_of_case or not has_keys_and_title:
             return rewritten_part
         sections[part["title"]] = rewritten_part
         return {"$ref": part["title"]}

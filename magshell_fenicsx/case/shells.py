@@ -218,17 +218,17 @@ class SeveralShells:
     @cached_property
     def digest(self) -> str:
         """Hash of all data from which the shells are made."""
-        contents = [
-            [
+        contents = list[list[Any]]()
+        for member in self.parts:
+            # the last entries: of each imperfection the number of modes for which it waits
+            content = [
                 member.name,
                 member.case.model_dump_json(),
                 member.section.place.model_dump_json(),
                 member.case.outside,
+                *(section.pending_modes for section in member.case.imperfections.values()),
             ]
-            # and of each imperfection the number of modes for which it waits
-            + [section.pending_modes for section in member.case.imperfections.values()]
-            for member in self.parts
-        ]
+            contents.append(content)
         return hashlib.sha256(
             json.dumps([contents, self.joints, self.pairs], sort_keys=True).encode()
         ).hexdigest()
@@ -296,8 +296,8 @@ class SeveralShells:
             # numbers by its own patches
             if own_thickness and own_thickness.of_position:
                 factors[member.name] = PlacedFactor(own_thickness, self.place(member), ratio)
-            own_patches = (own_thickness and own_thickness.patches) or {}
-            for name, factor in own_patches.items():
+            own_patches = own_thickness.patches if own_thickness else None
+            for name, factor in (own_patches or {}).items():
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
                 factors[f"{member.name}_{name}"] = ratio * factor
         if all(factor == 1.0 for factor in factors.values()):

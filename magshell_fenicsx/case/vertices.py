@@ -273,11 +273,13 @@ class Vertices:
         """
         chart, unit = self.points[name], self.unit
         place = self._place(chart)
+
+        def with_unit(coordinates: str) -> str:
+            """Return coordinates with the unit behind each of them."""
+            return ", ".join(f"{coordinate}{unit}" for coordinate in coordinates.split(", "))
+
         # coordinates of both places, each with its unit
-        text, other_text = (
-            ", ".join(f"{coordinate}{unit}" for coordinate in coordinates.split(", "))
-            for coordinates in distinguishable_texts(place, other_place)
-        )
+        text, other_text = map(with_unit, distinguishable_texts(place, other_place))
         distance, size = float(np.linalg.norm(place - other_place)), self.size(chart) * self.R
         # elements at which both places would fit, with a margin for the lines of a grid
         fit_size = GRID_FACTOR * distance / factor

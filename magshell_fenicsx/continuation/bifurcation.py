@@ -152,10 +152,12 @@ def _find_from_equilibrium(
     # K is not linear in an amplitude that is a prescribed position (one of the system's
     # `coordinates`): there the convergence of u does not show that of mu
     checks_load = name in system.coordinates
-    while not (
-        _has_converged(sizes)
-        and (not checks_load or _load_has_converged(load_changes, state.mu[name]))
-    ):
+    while True:
+        u_has_converged = _has_converged(sizes)
+        if u_has_converged and not checks_load:
+            break
+        if u_has_converged and _load_has_converged(load_changes, state.mu[name]):
+            break
         if len(sizes) == MAX_ITERATIONS:
             raise BifurcationLost
         tangent = AugmentedTangent(newton, state, b)
@@ -280,8 +282,12 @@ def _has_converged(sizes: Sequence[float]) -> bool:
     sizes
         Sizes of the steps so far, in lengths of the system.
     """
-    stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING_STEP
-    return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)
+    if not sizes:
+        return False
+    if sizes[-1] <= TOLERANCE:
+        return True
+    stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2
+    return stalled and sizes[-1] <= ROUNDING_STEP
 
 
 def _load_has_converged(changes: Sequence[float], mu: float) -> bool:

@@ -985,7 +985,8 @@ class Boundary:
         is_rounding = shrinks_slowly and sizes[-1] <= TOLERANCE
         u_has_converged = sizes[-1] * remaining <= TOLERANCE or is_rounding
         load_error = load_changes[-1] * remaining
-        return u_has_converged and (shrinks_slowly or load_error <= LOAD_TOLERANCE * self.scales[0])
+        load_has_converged = shrinks_slowly or load_error <= LOAD_TOLERANCE * self.scales[0]
+        return u_has_converged and load_has_converged
 
 
 def _diverges(sizes: Sequence[float], step: CurveVector) -> bool:

@@ -907,7 +907,8 @@ class ContinuationRun:
             The points from which the end of the step is extrapolated.
         """
         goal = self.goal
-        if self._by_arc and goal.targets and goal.until in ("target", "limit"):
+        ends_at_target = bool(goal.targets) and goal.until in ("target", "limit")
+        if self._by_arc and ends_at_target:
             return end_near_last_target(self.path, goal.quantity, goal.targets[-1], s, predictors)
         return s
 

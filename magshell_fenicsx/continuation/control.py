@@ -139,10 +139,13 @@ def nearest_combination(metric: Metric, a: Direction, span: Sequence[Direction])
     span
         The linearly independent directions that are combined.
     """
+
+    def products_with(direction: Direction) -> list[float]:
+        """Return the inner products of a direction with those of the span."""
+        return [metric.inner(direction, other_direction) for other_direction in span]
+
     # normal equations of the least distance
-    gram = [
-        [metric.inner(direction, other_direction) for other_direction in span] for direction in span
-    ]
+    gram = [products_with(direction) for direction in span]
     coefficients = np.linalg.solve(gram, [metric.inner(direction, a) for direction in span])
     weighted = list(zip(coefficients, span, strict=True))
     du = np.sum([coefficient * du for coefficient, (du, _) in weighted], axis=0)

@@ -73,11 +73,11 @@ def critical_boundary(
         last_point, successor = start, None
         for label, point in mode.follow(start, sense, ends, steps):
             # the crossing at which this boundary began is found again: it is left out
-            if last_point is start and label == "crossing" and point.met == begun_by:
+            if last_point is start and (label, point.met) == ("crossing", begun_by):
                 continue
             # other modes have become unstable, though no crossing was located
-            is_point = label in ("point", "end")
-            if not last_point.unstable and is_point and _unstable_families(mode, point):
+            may_be_overtaken = label in ("point", "end") and not last_point.unstable
+            if may_be_overtaken and _unstable_families(mode, point):
                 successor, sense = search.overtaking_mode(mode, point), point.p - last_point.p
                 yield label, successor.start, successor.mode
                 if label == "end":

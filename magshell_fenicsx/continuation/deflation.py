@@ -168,7 +168,7 @@ def find_deflated(
         step = _DeflatedStep(
             deflation, matrix, state.u, newton_step, tau=tau, M=deflation.value(state.u)
         )
-        if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
+        if not np.isfinite([size, tau]).all() or tau == 0.0:
             return None
         # close to a solution the deflation changes little: the undeflated step is the last one
         if size <= FINAL_STEP and 1 / MAX_DEFLATION_FACTOR < tau < MAX_DEFLATION_FACTOR:

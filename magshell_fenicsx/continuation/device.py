@@ -20,6 +20,7 @@ in a tangent. Vectors (u, y) have the k unknowns y on the last rank.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from itertools import product
 from math import log2
 
 import numpy as np
@@ -221,7 +222,8 @@ class Device:
         columns = [
             unit * system.load(u, mu, name) for name, unit in zip(names, self._units, strict=True)
         ]
-        D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
+        curvatures = [system.curvature(u, mu, i, j) for i, j in product(names, repeat=2)]
+        D = np.array(curvatures).reshape(len(names), len(names))
         # dq/dmu, which a function returns after q
         slopes = [
             0.0 if isinstance(conjugate, str) else conjugate(mu[name])[1]

@@ -13,6 +13,7 @@ K + D belongs to an earlier state.
 import time
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from types import TracebackType
 
 import numpy as np
@@ -606,7 +607,8 @@ class BlockElimination:
 
     def _products(self, vectors: list[Vector]) -> NDArray[np.float64]:
         """Return the inner products (len(vectors), k) of vectors with the columns of C."""
-        return np.array([[dot(self._comm, v, column) for column in self._C] for v in vectors])
+        products = [dot(self._comm, v, column) for v, column in product(vectors, self._C)]
+        return np.array(products).reshape(len(vectors), len(self._C))
 
 
 def join(u: Vector, y: Vector, comm: MPI.Comm) -> Vector:

@@ -95,7 +95,9 @@ def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
     rows = [first_row + int(i) for i in np.flatnonzero(e)]
     diagonal = comm.allreduce(sum(K.getValue(i, i) for i in rows))
     # spring and diagonal entry d add up to 2 |d|; where d is zero, the norm of K is the stiffness
-    stiffness = 2 * abs(diagonal) - diagonal or K.norm(PETSc.NormType.INFINITY) or 1.0
+    stiffness = 2 * abs(diagonal) - diagonal
+    if not stiffness:
+        stiffness = K.norm(PETSc.NormType.INFINITY) or 1.0
     for i in rows:
         K.setValue(i, i, stiffness, addv=True)
     K.assemble()

@@ -158,7 +158,8 @@ class Iterates:
         sizes = [s.size for s in earlier_own]
         grows = bool(sizes) and step.size > DIVERGENCE_RATIO * sizes[-1]
         # the first steps, and steps that a line search shortens, may grow
-        if len(earlier) > 2 and grows and not self.searched:
+        may_grow = len(earlier) <= 2 or self.searched
+        if grows and not may_grow:
             return "diverged"
         if len(sizes) >= self.patience and step.size > PATIENCE_RATIO * sizes[0]:
             return "diverged"

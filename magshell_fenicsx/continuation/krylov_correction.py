@@ -457,12 +457,10 @@ def crossings_with_lag(
     # where few vectors have a large ratio, D is corrected along them with the present product
     large_indices = [i for i, value in enumerate(uncertainties) if not value <= MAX_UNCERTAINTY]
     present = tangent.present_product
-    if (
-        present
-        and in_complement <= MAX_UNCERTAINTY
-        and 0 < len(large_indices) <= MAX_CORRECTED_VECTORS
-    ):
-        X, KX = ([vectors[i] for i in large_indices] for vectors in (X, KX))
+    are_few = 0 < len(large_indices) <= MAX_CORRECTED_VECTORS
+    can_correct = are_few and in_complement <= MAX_UNCERTAINTY
+    if present and can_correct:
+        X, KX = [X[i] for i in large_indices], [KX[i] for i in large_indices]
         missing_products = [present(x) - lagged.times(x) for x in X]
         D = SymmetricUpdate(tangent.D, X, missing_products, KX, comm)
         if corrected := count_crossings(D.times, solve_sparse, first, comm):

@@ -11,11 +11,13 @@ zero where g constrains u. v and a are velocity and acceleration, conjugates the
 forces on which amplitudes do work.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Device
@@ -233,7 +235,7 @@ def consistent_state(
         C, D = device.border(u, amplitudes)
         X, is_spring = [inverse_mass(c) for c in C], np.diag(D) != 0
         # derivatives of g: by y for springs, for constraints by a displacement along X
-        S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
+        S = np.where(is_spring, D, _products(comm, C, X))
         correction = np.linalg.solve(S, device.rows(u, amplitudes))
         # y changes by the springs, u by the constraints
         y = y - np.where(is_spring, correction, 0.0)
@@ -247,6 +249,12 @@ def consistent_state(
     normal_velocity = np.where(is_spring, 0.0, [dot(comm, c, v) for c in C])
     v = v - _combination(np.where(is_spring, 0.0, np.linalg.solve(S, normal_velocity)), X)
     return u, v, {**mu, **device.values(y)}
+
+
+def _products(comm: MPI.Comm, C: Sequence[Vector], X: Sequence[Vector]) -> Array:
+    """Return the inner products (len(C), len(X)) of the columns C with vectors X. Collective."""
+    products = [dot(comm, c, x) for c, x in product(C, X)]
+    return np.array(products).reshape(len(C), len(X))
 
 
 def _combination(coefficients: Array, vectors: list[Vector]) -> Vector:
@@ -283,7 +291,7 @@ def constrained_acceleration(
         )
     X = [inverse_mass(c) for c in C]
     # rows of amplitudes with a spring stay out: identity on the left, zero on the right
-    S = np.where(is_constraint, [[dot(system.comm, c, x) for x in X] for c in C], np.eye(len(C)))
+    S = np.where(is_constraint, _products(system.comm, C, X), np.eye(len(C)))
     # v . (dC/du v) by a central difference along the velocity
     curvature = [
         dot(system.comm, a - b, motion.v) / (2 * dt) for a, b in zip(forward, backward, strict=True)

@@ -346,7 +346,8 @@ class BorderedNewton:
         """
         factored = self._tangent.state  # None if no factors are known
         distance = self._distance(state, factored)
-        reuses_factors = distance <= self.options.reuse_distance and may_lag and not exact
+        may_reuse_factors = may_lag and not exact
+        reuses_factors = distance <= self.options.reuse_distance and may_reuse_factors
         if reuses_factors and needs_inertia:
             reuses_factors = self._tangent.inertia_is_certain
         matrix_state = factored if reuses_factors and factored else state
@@ -355,7 +356,8 @@ class BorderedNewton:
         )
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         # the matrix is not quite that of the solution: its tangent is refined by differences
-        if (distance and reuses_factors) or self._tangent.lagged:
+        is_of_nearby_state = distance != 0 and reuses_factors
+        if is_of_nearby_state or self._tangent.lagged:
             extrapolating = self._tangent.may_extrapolate
             refined = refined_tangent(
                 self.system, matrix, tangent, state, load, row, extrapolating=extrapolating
@@ -395,14 +397,11 @@ class BorderedNewton:
         """
         last_matrix, count = self._callbacks.matrix, self.factorisation.count
         factors = self._tangent.factor_at(state, may_lag=may_lag, needs_inertia=needs_inertia)
-        # the same objects, not equal ones
-        if (
-            count == factors.count
-            and last_matrix
-            and last_matrix.row is row
-            and last_matrix.state is state
-        ):
-            return last_matrix
+        if last_matrix and count == factors.count:
+            # the same objects, not equal ones
+            has_same_border = last_matrix.row is row and last_matrix.state is state
+            if has_same_border:
+                return last_matrix
         return BorderedMatrix(self.system, factors, state, name, row, lagged=self._tangent.lagged)
 
 

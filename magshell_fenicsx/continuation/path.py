@@ -604,7 +604,8 @@ class Path:
         # the quintic shows the error of the cubic, by which the step is shortened. It needs three
         # points for this, but four to show its own error
         is_third_point = len(points) == PREDICTOR_POINTS - 1
-        if takes_quintic or (is_third_point and not self.newton.options.has_onsets):
+        shows_cubic_error = is_third_point and not self.newton.options.has_onsets
+        if takes_quintic or shows_cubic_error:
             end = current.s + np.copysign(length, distance)
             length *= self._predictable_fraction(points, end, cubic_error)
         s = target if length == abs(distance) else current.s + np.copysign(length, distance)
@@ -634,7 +635,8 @@ class Path:
         if event.fraction < 1 and not event.ends_behind:  # it ends just before an onset of forces
             return self._checked_before_onset(current, result)
         # behind an onset the load may turn back: arc length along the displacement still grows
-        if event.ends_behind and self.control == "arc" and not isinstance(result, Point):
+        arc_has_failed = self.control == "arc" and not isinstance(result, Point)
+        if event.ends_behind and arc_has_failed:
             return self._try_step(plan.s, [self._measured_along_displacement(current)])
         return result
 
@@ -818,10 +820,8 @@ class Path:
             return "the step passed several instabilities, or jumped to another branch"
         # a kink changes no inertia, except where the load turns back there: then arc length is
         # measured along `across`
-        may_have_kink = self.newton.options.has_onsets and (
-            changed_pivots == 0 or current.across is not None
-        )
-        if may_have_kink:
+        inertia_allows_kink = changed_pivots == 0 or current.across is not None
+        if self.newton.options.has_onsets and inertia_allows_kink:
             return None if self._is_explained_by_kink(current, next_point) else SHARP_TURN
         return None if self._is_smooth(current, next_point) else SHARP_TURN
 

@@ -202,15 +202,13 @@ class LatestTangent:
         -------
         The factors, which the next call overwrites.
         """
-        factored, factors = self.state, self._factorisation
-        is_other = factored is not state and (
-            factored is None
-            or self._has_other_stress
-            or not factored.equals(state, self.system.comm)
-        )
+        factors, is_of_other_state = self._factorisation, self._is_of_other_state(state)
         # with an exact tangent required, a lagged one does not serve, even of the same state
         is_too_old = self.lagged and not may_lag
-        if is_other or is_too_old or (needs_inertia and not self.inertia_is_certain):
+        must_factor = is_of_other_state or is_too_old
+        if needs_inertia and not must_factor:
+            must_factor = not self.inertia_is_certain
+        if must_factor:
             self.lagged = may_lag and factor_with_lag(
                 self.system, factors, state, stress, needs_inertia=needs_inertia
             )
@@ -219,17 +217,24 @@ class LatestTangent:
             self._factored, self._has_other_stress = (state, factors.count), bool(stress)
         return factors
 
+    def _is_of_other_state(self, state: State) -> bool:
+        """Return whether the tangent that is factored is not that of a state. Collective."""
+        factored = self.state
+        if factored is state:
+            return False
+        if factored is None or self._has_other_stress:
+            return True
+        return not factored.equals(state, self.system.comm)
+
     @property
     def may_extrapolate(self) -> bool:
         """Whether forces of dense terms may be extrapolated from earlier states.
 
         There must be such terms, and their part of the tangent must have been small so far.
         """
-        return (
-            isinstance(self.system, InexactSystem)
-            and self.system.has_dense_terms
-            and self._factorisation.correction_is_small
-        )
+        if not isinstance(self.system, InexactSystem):
+            return False
+        return self.system.has_dense_terms and self._factorisation.correction_is_small
 
     @property
     def inertia_is_certain(self) -> bool:
@@ -239,9 +244,9 @@ class LatestTangent:
         """
         factors = self._factorisation
         is_known = factors.inertia_is_known or factors.count_corrected_inertia()
-        return is_known and (
-            not self.lagged or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
-        )
+        if not is_known:
+            return False
+        return not self.lagged or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
 
 
 def factor_with_lag(
@@ -367,12 +372,13 @@ class SnesCallbacks:
         self._guess, self._name, self._row = guess, name, row
         self._stress, self._has_stress = options.stress, bool(options.stress)
         newton, has_coordinates = self._options, bool(self._system.coordinates)
+        has_kinks = newton.has_onsets or options.extrapolating
         self._iterates = Iterates(
             largest=min(newton.largest_step, options.max_step),
             patience=LINE_SEARCH_PATIENCE if options.searched else newton.patience,
             searched=options.searched,
             # the force of a body is stiff
-            kinks=newton.has_onsets or options.extrapolating or has_coordinates,
+            kinks=has_kinks or has_coordinates,
             stops_early=options.max_step < np.inf,
             relative_tolerance=options.relative_tolerance,
         )
@@ -508,7 +514,9 @@ class SnesCallbacks:
         This is so if computed forces make the step much shorter; True too if no such comparison is
         possible.
         """
-        if not (self._is_extrapolated and self._state and self._chord and self.matrix):
+        if not (self._is_extrapolated and self._state):
+            return True
+        if not (self._chord and self.matrix):
             return True
         state, size = self._state, self._iterates.steps[-1].size
         # (R, g) with computed forces, and the step that they make
@@ -634,7 +642,8 @@ class SnesCallbacks:
             if size_at_end <= self._tolerance:
                 return True
         # Broyden's steps shrink unevenly: two of them count together
-        if is_first and len(steps) > 1 and size <= options.contraction**2 * steps[-2].size:
+        counts_two_steps = is_first and len(steps) > 1
+        if counts_two_steps and size <= options.contraction**2 * steps[-2].size:
             return True
         return ratio <= (options.contraction if is_first else options.late_contraction)
 

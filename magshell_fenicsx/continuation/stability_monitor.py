@@ -167,10 +167,7 @@ class PathSegment:
         PathStopped
             If the solve fails.
         """
-        # the same objects, by their places among the points of the segment
-        low_index, high_index = (
-            next(i for i, p in enumerate(self._points) if p is end) for end in (low, high)
-        )
+        low_index, high_index = self._index_of(low), self._index_of(high)
         if high_index - low_index > 1:
             return self._points[(low_index + high_index) // 2]
         if not solve:
@@ -182,6 +179,10 @@ class PathSegment:
         if isinstance(middle, str):
             raise PathStopped(f"locating an instability: {middle}", low)
         return self._insert(middle)
+
+    def _index_of(self, point: Point) -> int:
+        """Return the place among the points of the segment where this same object is."""
+        return next(i for i, p in enumerate(self._points) if p is point)
 
     def _insert(self, point: Point) -> Point:
         """Insert a point in the order of the path, and return it with its s measured from `low`."""
@@ -389,7 +390,8 @@ class StabilityMonitor:
         """
         self._distance += self._distance_between(self._last_point, point)
         self._last_point, self._u = point, point.state.u
-        if not evaluate and len(self._families) == 1 and self._is_still_stiff:
+        may_skip = not evaluate and len(self._families) == 1
+        if may_skip and self._is_still_stiff:
             self._skipped.append((point, self._distance))
             return []
         return self._crossings_to_last_point()
@@ -451,7 +453,8 @@ class StabilityMonitor:
         # all evaluations from the previous to the last point, in the order of the path
         evaluations = [new_evaluation]
         self._may_skip = min(max(1, 2 * len(self._skipped)), MAX_SKIPPED)
-        if self._skipped and (softened or changed):
+        is_unexpected = softened or changed
+        if self._skipped and is_unexpected:
             evaluations = [*(self._evaluate(*skipped) for skipped in self._skipped), new_evaluation]
             self._may_skip = 0
         if previous:
@@ -496,7 +499,8 @@ class StabilityMonitor:
         halvings
             Number of halvings of the step that are left.
         """
-        if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
+        can_be_halved = bool(halvings) and low.point.s != high.point.s
+        if not can_be_halved or not self._may_recover(other, low, high):
             return
         segment = PathSegment(self._path, low.point, high.point)
         # an estimated point costs no solve; it counts if in both halves no mode may recover
@@ -548,9 +552,9 @@ class StabilityMonitor:
             The evaluations at both ends.
         """
         tangents = self._excluded.tangents if self._excluded else None
-        if not tangents or low.numbers is None or high.numbers is None:
+        if not tangents or high.distance == low.distance:
             return False
-        if high.distance == low.distance:
+        if low.numbers is None or high.numbers is None:
             return False
         if other is None or other.numbers is None:
             return True

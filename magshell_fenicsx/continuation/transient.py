@@ -287,11 +287,9 @@ class Integrator:
         acceleration is continuous; a new one from the remaining residual would be large where the
         contact is stiff.
         """
-        return (
-            not self.contact
-            or self.supports is not None
-            or self.loads(t, True) != self.loads(t, False)
-        )
+        if not self.contact or self.supports is not None:
+            return True
+        return self.loads(t, True) != self.loads(t, False)
 
     def with_imbalance(self, motion: Motion) -> Motion:
         """Return a motion with its imbalance and turnover of energy. Collective.
@@ -413,12 +411,12 @@ class Integrator:
             # the tolerance is relative to a tenth of the displacement if that exceeds the length
             displacement = LENGTH_PER_DISPLACEMENT * max_abs(comm, u) / length
             # small steps that new factors do not shrink may be rounding
-            stalled = (
-                step_size <= MAX_ROUNDING_STEP and step_size > last_size / 2 and has_new_factors
-            )
-            if step_size <= TOLERANCE * max(1.0, displacement) or (
-                stalled and step_size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
-            ):
+            stalled = has_new_factors and last_size / 2 < step_size <= MAX_ROUNDING_STEP
+            has_converged = step_size <= TOLERANCE * max(1.0, displacement)
+            if stalled and not has_converged:
+                rounding_error = self._rounding_error(motion, u, y, dt)
+                has_converged = step_size <= ROUNDING_FACTOR * rounding_error
+            if has_converged:
                 return self._end_of_step(motion, u, y, dt)
             # the step does not shrink enough: give up, or go on with new factors
             if step_size > REFACTOR_RATIO * last_size:
@@ -616,7 +614,8 @@ class Integrator:
         K = tangent.K if isinstance(tangent, SkewedTangent | CorrectedTangent) else tangent
         # the tangent is another object, for example after a change of contact: it may have another
         # pattern, so the matrix of the step is made anew
-        if self._tangent is None or self._K is None or self._tangent.handle != K.handle:
+        is_other = self._tangent is None or self._tangent.handle != K.handle
+        if is_other or self._K is None:
             self._tangent, self._K = K, K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)

@@ -85,7 +85,9 @@ class DistributionSection(Section):
                 f"bounds closer to the mean, {self._mean:g}"
             )
         weights, values = self.weights, self.values or []
-        if weights is not None and (len(weights) != len(values) or not sum(weights)):
+        if weights is None:
+            return self
+        if len(weights) != len(values) or not sum(weights):
             raise ValueError("weights: one for each of the values, not all zero")
         return self
 

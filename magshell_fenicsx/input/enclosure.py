@@ -283,11 +283,10 @@ class Enclosure(NDArrayOperatorsMixin):
     @classmethod
     def coordinates(cls, low: Array, high: Array) -> "list[Enclosure]":
         """Return the functions x, y and z in boxes between corners `low` and `high` (n, 3)."""
-        halves, ones, zeros = (high - low).T / 2, np.ones(len(low)), np.zeros(len(low))
-        units = [
-            tuple(Interval.number(ones if i == j else zeros) for j in range(3)) for i in range(3)
-        ]
-        middle = (low + high) / 2
+        one, zero = Interval.number(np.ones(len(low))), Interval.number(np.zeros(len(low)))
+        # the slopes of x, y and z by x, y and z
+        units = [(one, zero, zero), (zero, one, zero), (zero, zero, one)]
+        middle, halves = (low + high) / 2, (high - low).T / 2
         return [
             cls(Interval(low[:, i], high[:, i]), units[i], middle[:, i], halves) for i in range(3)
         ]
@@ -298,7 +297,8 @@ class Enclosure(NDArrayOperatorsMixin):
         The values are bounded in two ways, whose intersection counts: by interval arithmetic, and
         by the value in the middle with the largest change that the slopes allow.
         """
-        if method != "__call__" or options or ufunc not in VALUES:
+        is_plain_call = method == "__call__" and not options
+        if not is_plain_call or ufunc not in VALUES:
             return NotImplemented
         intervals = [
             a.values if isinstance(a, Enclosure) else Interval.number(a) for a in arguments

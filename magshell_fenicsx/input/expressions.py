@@ -53,7 +53,8 @@ class Taylor(NDArrayOperatorsMixin):
         NumPy calls it for each of its functions. Arguments are `Taylor` objects or numbers.
         Functions without an entry in `PARTIALS` are not implemented.
         """
-        if method != "__call__" or options or ufunc not in PARTIALS:
+        is_plain_call = method == "__call__" and not options
+        if not is_plain_call or ufunc not in PARTIALS:
             return NotImplemented
         # derivatives of the function by its arguments, and those arguments that have derivatives
         values = [a.value if isinstance(a, Taylor) else a for a in arguments]
@@ -341,8 +342,10 @@ def _is_allowed(node: ast.AST, *, is_called: bool) -> bool:
         return node.id in (FUNCTIONS if is_called else NAMES)
     if isinstance(node, ast.Call):
         name = node.func.id if isinstance(node.func, ast.Name) else ""
+        if name not in FUNCTIONS or node.keywords:
+            return False
         # nin: the number of arguments of NumPy's function
-        return name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
+        return len(node.args) == FUNCTIONS[name].nin
     return isinstance(node, _ALLOWED)
 
 
@@ -574,9 +577,9 @@ class FormulasInSpace:
         """
         # value (3, n), gradient (3, 3, n) and second derivatives (3, 3, 3, n) of the components
         taylors, Q = [component(x @ self.axes) for component in self.components], self.axes
-        B, G, H = (
-            np.stack([getattr(f, d) for f in taylors]) for d in ("value", "gradient", "hessian")
-        )
+        B = np.stack([f.value for f in taylors])
+        G = np.stack([f.gradient for f in taylors])
+        H = np.stack([f.hessian for f in taylors])
         # from the formulas' frame to that of the places: each index is turned by Q
         return (
             np.einsum("ai,in->na", Q, B),

@@ -137,7 +137,9 @@ def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> s
             len(other_location) > len(location) and other_location[: len(location)] == location
             for other_location in locations
         )
-        return has_inner_error or (kind in NO_CONTAINER and locations.count(location) > 1)
+        if has_inner_error:
+            return True
+        return kind in NO_CONTAINER and locations.count(location) > 1
 
     # two members of a union may give one line
     lines = [
@@ -287,7 +289,8 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
         # a word that neither the class nor the data has as a key is the tag of another union: one
         # of values, or of a section and a list of it
         fields = sections[0].model_fields if len(sections) == 1 else ()
-        may_be_tag = len(sections) < 2 and not is_name and isinstance(key, str)
+        is_word = isinstance(key, str) and not is_name
+        may_be_tag = is_word and len(sections) < 2
         if may_be_tag and key not in {*fields, *_data_at(data, keys, dict)}:
             continue
         # a name of the user, which may look like a tag or a key
@@ -313,8 +316,8 @@ def _data_at(data: Any, location: Sequence[str | int], kind: type) -> Any:
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
-        elif isinstance(data, list) and isinstance(key, int) and key < len(data):
-            data = data[key]
+        elif isinstance(data, list) and isinstance(key, int):
+            data = data[key] if key < len(data) else None
         else:
             data = None
     return data if isinstance(data, kind) else kind()
@@ -393,7 +396,8 @@ def _section_at(
         # the field is None if the key is a position in a list, a name of the user, or unknown;
         # positions and names keep the sections that the key before them has
         field = None if is_name else section.model_fields.get(str(key))
-        if field or not (is_name or isinstance(key, int)):
+        is_name_or_position = is_name or isinstance(key, int)
+        if field or not is_name_or_position:
             sections = _models(field.annotation) if field else []
         is_name = _has_names(field)
         # of several sections the one whose tag the data have, or else the first
@@ -422,9 +426,10 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 def _tag_key(models: list[type[BaseModel]]) -> str:
     """Return the key, kind or geometry, that chooses one of section classes; empty without."""
-    return next(
-        (key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), ""
-    )
+    for key in ("kind", "geometry"):
+        if all(key in m.model_fields for m in models):
+            return key
+    return ""
 
 
 def _tags(model: type[BaseModel]) -> list[str]:

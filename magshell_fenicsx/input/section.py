@@ -154,8 +154,10 @@ def in_unit(text: str, unit: str) -> float:
     """
     number, unit_of_text = number_and_unit(text)
     # a bare number, where that is allowed
-    if not unit_of_text and number and (not unit or float(number) == 0):
-        return float(number)
+    if number and not unit_of_text:
+        value = float(number)
+        if not unit or value == 0:
+            return value
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
     # the same unit needs no rounding by a conversion

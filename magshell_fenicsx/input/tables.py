@@ -200,7 +200,7 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
     """
     try:
         lines = table_text((files or Files()).content(file)).splitlines()
-        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if row]
+        header, *rows = [_without_blanks(row) for row in csv.reader(lines) if row]
     except (OSError, ValueError, csv.Error) as e:
         raise CaseError(
             f"{key}: {file}: cannot be read: {getattr(e, 'strerror', None) or 'no table'}"
@@ -215,11 +215,16 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
     )
 
 
+def _without_blanks(row: Sequence[str]) -> list[str]:
+    """Return the cells of a row without blanks around their texts."""
+    return [cell.strip() for cell in row]
+
+
 def write_vectors(file: Path, places: Array, vectors: Array) -> None:
     """Write a CSV file of places and vectors, see `read_vectors`, with all digits."""
     dim = places.shape[1]
     lines = [",".join((*PLACES[dim], *VECTORS[dim]))]
-    lines += [",".join(repr(float(v)) for v in row) for row in np.hstack([places, vectors])]
+    lines += [",".join(map(repr, map(float, row))) for row in np.hstack([places, vectors])]
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -247,10 +252,13 @@ def _points_and_vectors(
     CaseError
         If a row lacks a finite number, or there are too many rows or none.
     """
+
+    def numbers(row: Sequence[str]) -> list[float]:
+        """Return the numbers of a row in the order of `columns`."""
+        return [float(row[header.index(name)]) for name in columns]
+
     try:
-        values = np.array(
-            [[float(row[header.index(name)]) for name in columns] for row in rows]
-        ).reshape(-1, 2 * dim)
+        values = np.array([numbers(row) for row in rows]).reshape(-1, 2 * dim)
     except (ValueError, IndexError):
         raise CaseError(f"{key}: {file}: has a row without a number in each column") from None
     if not 0 < len(values) <= MAX_CONTROL_POINTS or not np.isfinite(values).all():
@@ -348,7 +356,7 @@ def _rows(text: str, separator: str | None, begin: int) -> Iterator[tuple[int, l
     bare = (line.partition("#")[0] if number > begin else "" for number, line in numbered)
     if separator:
         reader = csv.reader(bare, delimiter=separator)
-        rows = ((reader.line_num, [cell.strip() for cell in row]) for row in reader)
+        rows = ((reader.line_num, _without_blanks(row)) for row in reader)
     else:
         rows = ((i, line.replace('"', "").split()) for i, line in enumerate(bare, 1))
     return ((number, row) for number, row in rows if any(row))

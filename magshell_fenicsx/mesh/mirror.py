@@ -246,7 +246,9 @@ class Sector(Mirror):
     waves: int = 2
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Sector) and self.waves == other.waves and super().__eq__(other)
+        if not isinstance(other, Sector):
+            return False
+        return self.waves == other.waves and super().__eq__(other)
 
     def __hash__(self) -> int:
         return hash((super().__hash__(), self.waves))
@@ -366,7 +368,9 @@ def _triangles_in_half(patch: PatchMesh, mirror: Mirror) -> NDArray[np.bool_]:
     depths = np.where(in_half[:, None], corners, -corners)  # into each triangle's own half
     crosses_plane = depths.min() < -ROUNDING * extent
     lies_in_plane = depths.max(axis=1).min() <= ROUNDING * extent
-    if in_half.all() or not in_half.any() or crosses_plane or lies_in_plane:
+    is_on_one_side = in_half.all() or not in_half.any()
+    meets_plane = crosses_plane or lies_in_plane
+    if is_on_one_side or meets_plane:
         raise MeshError(
             f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: "
             "mesh it with a curve there"

@@ -289,7 +289,8 @@ class UserMesh:
         self.mesh.topology.create_entities(dimension)
         entities = self.mesh.topology.index_map(dimension)
         count = entities.size_local + entities.num_ghosts
-        if numbers.ndim != 1 or (len(numbers) and numbers.dtype.kind not in "iu"):
+        holds_no_integers = numbers.size > 0 and numbers.dtype.kind not in "iu"
+        if numbers.ndim != 1 or holds_no_integers:
             hint = ": np.flatnonzero(...) of a mask" if numbers.dtype.kind == "b" else ""
             return (
                 f"is neither a value of tags nor a list of local numbers of {entities_name}{hint}"

@@ -94,10 +94,15 @@ def _narrow_parts(group: Array, max_width: float) -> list[Array]:
     return [*_narrow_parts(group[lower], max_width), *_narrow_parts(group[~lower], max_width)]
 
 
+def _texts(place: Array, digits: int) -> list[str]:
+    """Return the coordinates of a place as texts with a number of digits."""
+    return [f"{c + 0.0:.{digits}g}" for c in place]
+
+
 def distinguishable_texts(a: Array, b: Array) -> tuple[str, str]:
     """Return the coordinates (n,) of two places as texts, with digits that show the difference."""
     for digits in range(MIN_DIGITS, MAX_DIGITS + 1):
-        texts = [[f"{c + 0.0:.{digits}g}" for c in place] for place in (a, b)]
+        texts = [_texts(place, digits) for place in (a, b)]
         difference = np.array(texts[1], dtype=np.float64) - np.array(texts[0], dtype=np.float64)
         error = np.abs(difference - (b - a)).max()
         if error <= TEXT_PRECISION * np.abs(b - a).max():

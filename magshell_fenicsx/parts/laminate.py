@@ -125,7 +125,8 @@ class LaminateSection(Section):
             raise ValueError("plies: their fractions must add up to 1")
         if len(frozenset[bool]().union(*(ply._with_units for ply in self.plies))) > 1:
             raise ValueError("plies: give each of E1, E2, G12 a unit, or none of them")
-        if self.along is not None and self.along != MERIDIAN and not np.any(self.along):
+        is_vector = self.along is not None and self.along != MERIDIAN
+        if is_vector and not np.any(self.along):
             raise ValueError("along: a vector of length zero is no direction")
         return self
 
@@ -185,7 +186,8 @@ class LaminateSection(Section):
         It is None if the angle 0 is along the meridians. The default depends on the shell's
         `geometry`.
         """
-        if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
+        is_meridian_by_default = self.along is None and geometry not in FLAT
+        if self.along == MERIDIAN or is_meridian_by_default:
             return None
         return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))
 

@@ -80,7 +80,9 @@ class PathStep(Step):
         conjugate.
         """
         default = cls.model_fields["control"].default
-        if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
+        if not isinstance(data, dict) or "control" in data:
+            return data
+        if default != cls.conjugate_control:
             return data
         quantities = {
             target.quantity for key, target in cls.targets.items() if data.get(key) is not None
@@ -106,8 +108,10 @@ class PathStep(Step):
                     f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size"
                 )
         # until: target needs one target that fits; a step with a default target, `_end`, needs none
-        has_one_target = len(targets) == 1 or (not targets and bool(self._end))
-        if self.until == "target" and not (has_one_target and set(targets) <= set(fitting)):
+        has_default_alone = not targets and bool(self._end)
+        has_one_target = len(targets) == 1 or has_default_alone
+        targets_fit = has_one_target and set(targets) <= set(fitting)
+        if self.until == "target" and not targets_fit:
             names = " or ".join(fitting) or "another control"
             raise ValueError(
                 f"until: target with control: {self.control} needs {names} (and nothing else) as "
@@ -119,7 +123,8 @@ class PathStep(Step):
             raise ValueError(f"{' and '.join(targets)}: a branch has one target")
         if self.until == "zero" and targets:
             raise ValueError(f"{next(iter(targets))} is a target: it goes with until: target")
-        if self.until == "bifurcation" and targets and not follows_branch:
+        ends_at_bifurcation = self.until == "bifurcation" and not follows_branch
+        if ends_at_bifurcation and targets:
             raise ValueError(
                 f"{next(iter(targets))} is a target: it goes with until: target or limit"
             )
@@ -161,7 +166,8 @@ class PathStep(Step):
                 f"{targets[0]} is a target: it goes with until: target; or write until: limit, "
                 "for the first instability on the way there"
             )
-        if len(targets) > 1 or self.prescribed == "load" or targets[0] not in fitting:
+        has_fitting_target = len(targets) == 1 and targets[0] in fitting
+        if self.prescribed == "load" or not has_fitting_target:
             raise ValueError(
                 f"{' and '.join(targets)}: beside until: limit stands one target, the end of the "
                 "way, with control: arc"
@@ -270,7 +276,8 @@ class PathStep(Step):
         change = load_start.size if end is None else end - begin_value
         # values at which the path must have a point: ahead of the begin, in the direction of change
         targets: list[float] = []
-        if end is not None and (self.until == "target" or self.limit_target):
+        goes_to_end = self.until == "target" or self.limit_target is not None
+        if end is not None and goes_to_end:
             begin = begin_value if load_start.is_driven else self.begin(begin_value)
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
@@ -311,9 +318,9 @@ class PathStep(Step):
 
     def by_conjugate(self, *, at_target: bool) -> bool:
         goal = self.target if at_target and self.until == "target" else None
-        return self.control == self.conjugate_control or (
-            goal is not None and goal[0].quantity == "conjugate"
-        )
+        if goal is not None and goal[0].quantity == "conjugate":
+            return True
+        return self.control == self.conjugate_control
 
     def begin(self, step_start: float) -> float:
         """Return where the equal parts of the first way to a target begin, by default at zero.

@@ -184,10 +184,11 @@ class Library:
         CalledProcessError
             If the compiler has failed.
         """
-        if not self._path and self._compilation and self._compilation.done():
-            self._path = self._compilation.result()
-        elif not self._path and not self._compilation:
-            self._path = cached_file(self.file)
+        if not self._path:
+            if not self._compilation:
+                self._path = cached_file(self.file)
+            elif self._compilation.done():
+                self._path = self._compilation.result()
         return self._path is not None
 
     @property
@@ -204,7 +205,9 @@ class Library:
         RuntimeError
             If the folder of the kernels cannot be written.
         """
-        if self.is_compiled or self._compilation or not self._take_lock():
+        if self.is_compiled or self._compilation:
+            return
+        if not self._take_lock():
             return
         try:
             if not self.is_compiled:  # another process may have compiled it meanwhile

@@ -78,7 +78,9 @@ def _usual_folder() -> Path:
     from dolfinx.jit import get_options  # takes long to import
 
     usual, base = Path(get_options()["cache_dir"]), os.environ.get("XDG_CACHE_HOME")
-    if base is not None and not Path(base).is_absolute() and usual == Path(base) / "fenics":
+    if base is None or Path(base).is_absolute():
+        return usual.absolute()
+    if usual == Path(base) / "fenics":
         # The specification of XDG_CACHE_HOME says that an empty or relative one is ignored.
         return Path.home() / ".cache" / "fenics"
     return usual.absolute()
@@ -96,7 +98,8 @@ def _cache_folders(usual: Path) -> tuple[Path, ...]:
         # the usual folder may be for reading by all; a private one is not
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o755 if folder == usual else 0o700)
-        if folder.is_dir() and os.access(folder, os.W_OK) and _is_private(folder):
+        is_writable = folder.is_dir() and os.access(folder, os.W_OK)
+        if is_writable and _is_private(folder):
             return tuple(dict.fromkeys((folder, *readable)))
     if readable:
         return readable  # has what was compiled before
@@ -132,7 +135,10 @@ def _protects_content(status: os.stat_result) -> bool:
     They cannot if they may not write to it, or if it is sticky.
     """
     owned = status.st_uid in (0, os.getuid(), *_unmapped_users())
-    return owned and (bool(status.st_mode & stat.S_ISVTX) or not _writable_by_others(status))
+    if not owned:
+        return False
+    is_sticky = bool(status.st_mode & stat.S_ISVTX)
+    return is_sticky or not _writable_by_others(status)
 
 
 def _writable_by_others(status: os.stat_result) -> bool:

@@ -257,13 +257,7 @@ def _vtk_declared_bytes(content: bytes) -> int:
         fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
         return 8 * (3 * max(counts, default=0) + sum(fields))
     # an XML file: the points of structured grids, from first and last index in each direction
-    extents = [
-        [int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)
-    ]
-    points = [
-        prod(abs(b - a) + 1 for a, b in zip(extent[::2], extent[1::2], strict=False))
-        for extent in extents
-    ]
+    points = [_points_in_extent(numbers) for numbers in EXTENT.findall(content)]
     max_count = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
     # components of each array; one where the tag does not say
     widths = [
@@ -271,3 +265,9 @@ def _vtk_declared_bytes(content: bytes) -> int:
         for tag in ARRAY_TAG.findall(content)
     ]
     return 8 * max_count * (3 + sum(widths))
+
+
+def _points_in_extent(numbers: bytes) -> int:
+    """Return the points of a grid from the text of first and last index in each direction."""
+    extent = [int(n) for n in re.findall(rb"-?\d+", numbers)]
+    return prod(abs(b - a) + 1 for a, b in zip(extent[::2], extent[1::2], strict=False))

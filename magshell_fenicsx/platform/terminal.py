@@ -77,12 +77,10 @@ def is_plain_output(ranks: int) -> bool:
 
     That is so if standard output is no terminal, or if there are several ranks.
     """
-    return (
-        ranks > 1
-        or bool(LAUNCHER_VARIABLES & os.environ.keys())
-        or not sys.stdout.isatty()
-        or os.environ.get("TERM") == "dumb"
-    )
+    may_have_several_ranks = ranks > 1 or bool(LAUNCHER_VARIABLES & os.environ.keys())
+    if may_have_several_ranks or not sys.stdout.isatty():
+        return True
+    return os.environ.get("TERM") == "dumb"
 
 
 @contextmanager

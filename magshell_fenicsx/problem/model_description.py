@@ -91,7 +91,8 @@ def _imperfections_text(context: Context, rims: int) -> str:
         words = [f"{count} of kind {kind}" for kind, count in kinds.items()]
     warning = ""
     is_mesh_file = isinstance(context.shell, MeshSurface)
-    if any(section.patch for section in sections) and (is_mesh_file or rims > MAX_RIMS):
+    lacks_rims = is_mesh_file or rims > MAX_RIMS
+    if lacks_rims and any(section.patch for section in sections):
         reason = "of a mesh file" if is_mesh_file else f"of more than {MAX_RIMS}"
         warning = f"; elements lie across the rims of dimples, {reason}: k_d is then less exact"
     return f"imperfections: {', '.join(words)}{warning}"

@@ -98,13 +98,17 @@ def layer_bounds(context: Context) -> list[float]:
     element_count, magnetic = _solid_section(context).layers, context.section_of(MagneticSection)
     # layers of the remanence, from the inner face outwards
     remanent = magnetic and magnetic.remanent
-    magnetised = (remanent and remanent.layers) or []
+    layers = remanent.layers if remanent else None
+    magnetised = layers or []
     if not magnetised:
         return [n / element_count for n in range(element_count + 1)]
+
+    def end_of_layer(n: int) -> float:
+        """Return the height at which the magnetised layer n ends."""
+        return sum(layer.fraction for layer in magnetised[: n + 1])
+
     # ends of magnetised layers inside the thickness; the last one ends at the outer face
-    layer_tops = [
-        sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
-    ]
+    layer_tops = [end_of_layer(n) for n in range(len(magnetised) - 1)]
     # heights at which elements must end; each interval between them is divided equally
     inner_bounds = {MIDSURFACE_HEIGHT, *(round(top, HEIGHT_DIGITS) for top in layer_tops)}
     bounds = [0.0]
@@ -326,8 +330,10 @@ class Problem:
 
         Inertia then resists its rigid motions.
         """
-        statics = [step for step in self.programme if not _needs_inertia_alone(step)]
-        return bool(self.programme) and not (statics or self.frequencies or self.stability)
+        has_requests_at_rest = self.frequencies or self.stability
+        if not self.programme or has_requests_at_rest:
+            return False
+        return all(_needs_inertia_alone(step) for step in self.programme)
 
     @property
     def support_hint(self) -> str:

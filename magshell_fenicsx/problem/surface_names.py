@@ -108,7 +108,8 @@ def refuse_unfit(
     for registered in OBSERVABLES:
         registered.refuse_unfit(loads, patch)
     # patches with a thickness of their own: `patch_of` raises if there is no such patch
-    for name in (thickness and thickness.patches) or {}:
+    thickness_patches = thickness.patches if thickness else None
+    for name in thickness_patches or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")
 
 
@@ -141,8 +142,14 @@ def _refuse_ambiguous(
 ) -> None:
     """Refuse the support of a name that both an edge and a point have, by a MeshError."""
     for name, condition in conditions.items():
-        if isinstance(condition, HeldComponents) and name in edges and name in points:
+        is_ambiguous = name in edges and name in points
+        if isinstance(condition, HeldComponents) and is_ambiguous:
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
+
+
+def _pairs_among(vertices: set[int], pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Return the pairs of which both vertices are among some vertices."""
+    return {pair for pair in pairs if vertices.issuperset(pair)}
 
 
 def open_edges(
@@ -164,8 +171,7 @@ def open_edges(
         under_pressure = np.logical_or.reduce([patch.patches[name] for name in patch_names])
         vertices = set(map(int, patch.corners[under_pressure].ravel()))
         pairs_of_edges = {
-            name: {pair for pair in pairs if vertices.issuperset(pair)}
-            for name, pairs in pairs_of_edges.items()
+            name: _pairs_among(vertices, pairs) for name, pairs in pairs_of_edges.items()
         }
 
     def places_of(name: str) -> NDArray[np.float64]:

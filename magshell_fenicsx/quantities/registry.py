@@ -287,12 +287,11 @@ def quantity(name: str) -> Quantity:
             f"Displacement conjugate to {conjugate[1]}, as w_over_h.",
         )
     # the amplitude of a second step of a kind
-    numbered_name = re.fullmatch(r"(\w+)_(\d+)", name)
-    first_of_kind = QUANTITIES.get(numbered_name[1]) if numbered_name else None
-    if numbered_name and first_of_kind and first_of_kind.kind == "load":
-        return replace(
-            first_of_kind, name=name, words=f"{first_of_kind.words} {numbered_name[2]}", symbol=""
-        )
+    if numbered_name := re.fullmatch(r"(\w+)_(\d+)", name):
+        first_of_kind = QUANTITIES.get(numbered_name[1])
+        if first_of_kind and first_of_kind.kind == "load":
+            words = f"{first_of_kind.words} {numbered_name[2]}"
+            return replace(first_of_kind, name=name, words=words, symbol="")
     # one of a family: of "approach_ball" it is "approach"; the longest name that fits is the right
     # one
     families = [q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)]

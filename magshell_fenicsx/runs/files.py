@@ -380,7 +380,8 @@ class RunFiles:
         shell_data = ShellData(problem.material.h, problem.material.nu, mirror, self._R)
         magnetic = problem.loads.magnetic
         # bodies and sources are drawn as outlines: one file for each point if they move, else one
-        outlines_move = problem.loads.contacts or (magnetic and magnetic.driven)
+        has_moving_sources = bool(magnetic and magnetic.driven)
+        outlines_move = problem.loads.contacts or has_moving_sources
         outlines_file = ""
         if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
             outlines_file = FILE_OF_POINT if outlines_move else FILE_OF_ALL_POINTS
@@ -424,7 +425,8 @@ class RunFiles:
             problem = scene.problem
             # the files have one half only if ParaView mirrors it, from the first point on
             shell = surface
-            if mirror and (isinstance(mirror, Sector) or self._has_whole_shell):
+            has_no_plane = isinstance(mirror, Sector) or self._has_whole_shell
+            if mirror and has_no_plane:
                 shell = completed_by_symmetry(surface, mirror)
             # bodies and sources beside the shell
             loads_and_state = problem.loads, state.mu, problem.material.h

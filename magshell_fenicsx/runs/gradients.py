@@ -223,8 +223,9 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
     reason = next(
         (remark for remark in result.remarks if remark.startswith(BEYOND_INSTABILITY)), None
     )
-    if result.stopped or reason or history.end is None:
-        raise LostResult(result.stopped or reason or "the path has no end")
+    obstacle = result.stopped or reason
+    if obstacle or history.end is None:
+        raise LostResult(obstacle or "the path has no end")
     refuse_moving(scene, history.end, name)
     return adjoint_at_end(scene, history, name)
 

@@ -71,7 +71,8 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
         On every rank, if something cannot be written.
     """
     section = result.scene.problem.stability
-    if result.singular or (section and not result.is_refused):
+    has_requested_modes = section is not None and not result.is_refused
+    if result.singular or has_requested_modes:
         writer = _ModeWriter(result, folder, say)
         writer.null_vectors()
         if section:
@@ -164,8 +165,10 @@ class _ModeWriter:
                 self.result.mode_places[number] = [
                     float(x) for x in rounded_place * scene.problem.length
                 ]
+            if surface is None or label:
+                continue
             # on rank 0, of a mode of the model itself: the number of waves, if it has any
-            if surface is not None and not label and (waves := waves_around(surface)):
+            if waves := waves_around(surface):
                 self.say(_waves_message(number, waves))
 
     def modes(self, section: StabilitySection) -> None:
@@ -276,9 +279,9 @@ def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
     The states of the start and of the end are known anyway. `point` is the number of its row.
     """
     requested_points = section.at if section else ()
-    return requested_points == "all" or (
-        isinstance(requested_points, list) and point in requested_points
-    )
+    if requested_points == "all":
+        return True
+    return isinstance(requested_points, list) and point in requested_points
 
 
 def symmetric_wave(model: Model) -> str:

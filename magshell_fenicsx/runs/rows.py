@@ -22,6 +22,8 @@ from magshell_fenicsx.simulate.scene import Scene
 if TYPE_CHECKING:
     import pandas
 
+    from magshell_fenicsx.parts.motion.motion_step import TimeSection
+
 SUMMED_COLUMNS = ("time", "dissipated", "work")
 
 
@@ -133,6 +135,16 @@ def imbalances(
             )
 
 
+def _chooses_step_length(motion: "TimeSection | None") -> bool:
+    """Return whether a motion chooses the length of its steps itself.
+
+    One to an instability does not count, as it ends where states become unstable.
+    """
+    if motion is None:
+        return False
+    return motion.step is None and motion.until != "instability"
+
+
 def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> Iterator[str]:
     """Yield warnings about motions whose error is, or may be, larger than their tolerance.
 
@@ -155,13 +167,9 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
                 f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
-        # a motion that chooses the length of its steps itself; one to an instability does not
-        # count, as it ends where states become unstable
-        chooses_step_length = (
-            load.motion and load.motion.step is None and load.motion.until != "instability"
-        )
+        estimates_own_steps = motion.errors == "step" and _chooses_step_length(load.motion)
         is_unstable = any(int(row["negative_pivots"]) for row in rows)
-        if chooses_step_length and motion.errors == "step" and is_unstable:
+        if estimates_own_steps and is_unstable:
             yield (
                 f"step {step.number}: it passes unstable states, which magnify the errors of its "
                 "steps in time; errors: motion keeps those of the motion below tolerance"
@@ -210,7 +218,10 @@ class Table(dict[str, NDArray[np.generic]]):
 
 def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
     """Return the columns of rows: those that every run has, and the named extra ones."""
-    return Table({name: np.array([row[name] for row in rows]) for name in (*COLUMNS, *extra)})
+    columns = Table()
+    for name in (*COLUMNS, *extra):
+        columns[name] = np.array([row[name] for row in rows])
+    return columns
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> Table:

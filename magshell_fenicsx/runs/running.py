@@ -149,8 +149,9 @@ class Watch:
         Interrupted
             On every rank, if any rank has been asked to stop or has reached the limit.
         """
-        if limited and self._limit is not None and time.perf_counter() - self._start >= self._limit:
-            self._reason = self._reason or f"the time limit of {self._limit:g} s"
+        limit = self._limit if limited else None
+        if limit is not None and time.perf_counter() - self._start >= limit:
+            self._reason = self._reason or f"the time limit of {limit:g} s"
         # of the first rank that has one, so that all ranks raise together
         reason = next(filter(None, self._comm.allgather(self._reason)), None)
         if reason:
@@ -291,7 +292,8 @@ def run(  # noqa: PLR0913 - what a user gives
     progress = _kernel_progress(output, keeps_first=is_plain_output(comm.size))
     # the run; the compilation of kernels also reports its progress if somebody listens
     with reporting_progress_to(progress) if has_listener else nullcontext():
-        if pictures and folder and comm.rank == 0:
+        draws_pictures = pictures and comm.rank == 0
+        if folder and draws_pictures:
             from magshell_fenicsx.output.pictures.rendering import library
 
             library()  # before anything is solved: there may be no compiler
@@ -370,8 +372,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interruption, result.stopped = e, str(e)
-        if files and folder and files.journal:
-            result.replayed = files.journal.replayed
+        if files and folder:
             interruption = _write_results(result, files, folder, output, progress, interruption)
     # the reason of an interruption, and how to go on where a journal has been written
     if interruption:
@@ -427,6 +428,8 @@ def _write_results(
 ) -> RuntimeError | None:
     """Write what follows the path: summary, modes, pictures and report; collective.
 
+    It writes nothing if the path has not begun: the files have no journal then.
+
     Parameters
     ----------
     interruption
@@ -438,6 +441,9 @@ def _write_results(
     RuntimeError or None
         The given interruption, or else the error of the disk that occurred while writing.
     """
+    if not files.journal:
+        return interruption
+    result.replayed = files.journal.replayed
     pictures = output.pictures and not interruption  # an interrupted run draws none
     try:
         files.write_summary(summary(result, time.perf_counter() - output.start))
@@ -601,7 +607,9 @@ def _branch_error(result: Result) -> float | None:
     """
     assert result.adapted
     mesh_of_branch, last_record = result.adapted.branch, result.last_record
-    if mesh_of_branch is None or last_record is None or last_record.scene is result.scene:
+    if mesh_of_branch is None or last_record is None:
+        return None
+    if last_record.scene is result.scene:
         return None
     from magshell_fenicsx.simulate.adapt.branch import branch_error
 
@@ -645,9 +653,11 @@ def _barrier(result: Result) -> float | None:
     It is between the states at the step's begin and end; None for other last steps.
     """
     steps, begin = result.scene.problem.programme, result.path_history.begin
+    if not steps or begin is None:
+        return None
     # a step with `until: zero` passes the largest load and goes back to the load zero: the unstable
     # state there, of the highest energy, is the top of the barrier
-    if not steps or steps[-1].until != "zero" or begin is None:
+    if steps[-1].until != "zero":
         return None
     from magshell_fenicsx.simulate.results import barrier
 

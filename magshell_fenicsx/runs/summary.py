@@ -41,6 +41,11 @@ Array = NDArray[np.float64]
 JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # parts of the way of a snap, between which it jumps
 
 
+def _numbers_in(rows: Sequence[Row], column: str) -> NDArray[np.float64]:
+    """Return the numbers (n,) of a column of rows."""
+    return np.array([float(row[column]) for row in rows])
+
+
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return the motions of a path that begin at a fold and end at rest (`then: snap`).
 
@@ -62,10 +67,7 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
             continue  # it has not come to rest
-        t, w, dissipated = (
-            np.array([float(row[key]) for row in moving])
-            for key in ("time", "w_over_h", "dissipated")
-        )
+        t, w, dissipated = (_numbers_in(moving, key) for key in ("time", "w_over_h", "dissipated"))
         # times since the fold at three parts of the way of the deflection. The last two rows are of
         # one time: the end of the motion, and the equilibrium at rest, which is left out.
         part_of_way = (w - w[0]) / (w[-1] - w[0])
@@ -231,21 +233,25 @@ class Result:
         Each has its load, displacement and kind, and the place where its mode is largest if known.
         """
         return [
-            {
-                **self.scene.sizes.values({key: row[key] for key in _with_units(row)}),
-                "amplitude": row["amplitude"],
-                "value": row[amplitude(str(row["amplitude"])).column],
-                "p_over_pc": row["p_over_pc"],
-                "w_pole_over_h": row["w_pole_over_h"],
-                "kind": row["label"],
-                "mode": row["mode"],
-                "branch": row["branch"],
-                "load_error": row["load_error"],
-                **self._mode_at(number),
-            }
+            self._limit_point(number, row)
             for number, row in enumerate(self.rows)
             if row["label"] in LOCATED
         ]
+
+    def _limit_point(self, number: int, row: Row) -> dict[str, Any]:
+        """Return the located instability at a row, which has this number among the rows."""
+        return {
+            **self.scene.sizes.values({key: row[key] for key in _with_units(row)}),
+            "amplitude": row["amplitude"],
+            "value": row[amplitude(str(row["amplitude"])).column],
+            "p_over_pc": row["p_over_pc"],
+            "w_pole_over_h": row["w_pole_over_h"],
+            "kind": row["label"],
+            "mode": row["mode"],
+            "branch": row["branch"],
+            "load_error": row["load_error"],
+            **self._mode_at(number),
+        }
 
     def _mode_at(self, number: int) -> dict[str, list[float]]:
         """Return the entries of summary.json about where the mode of an instability is largest.

@@ -72,7 +72,8 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         # edges of the half that is not modelled, and their images
         for side, image in enumerate(images_of_sides):
             is_glued = grid.glued[side // 2]
-            if side != image and distances[side] < 0 and not is_glued:
+            is_on_other_half = side != image and distances[side] < 0
+            if is_on_other_half and not is_glued:
                 removed_edges[grid.sides[side]] = grid.sides[image]
         mirrors.append(Mirror(mirror.normal, mirror.offset, removed_edges))
     return mirrors

@@ -238,7 +238,8 @@ def _place(at: At, ground: ReferenceShell, key: str) -> Array:
         return direction
     # elsewhere only the pole or the tip has a direction, which is zero
     has_pole_or_tip = perfect.disc or ground.geometry == "strip"
-    if at.polar or perfect.highest is None or not has_pole_or_tip:
+    is_elsewhere = at.polar or not has_pole_or_tip
+    if perfect.highest is None or is_elsewhere:
         raise CaseError(
             f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}"
         )
@@ -300,7 +301,8 @@ def cylinder_lines(radius: float, height: float) -> list[Array]:
     """Return the outline of a cylinder about z: both circles, and four lines between them."""
     ends = np.array([-height / 2, height / 2])
     corners = radius * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-    sides = [np.array([[x, y, z] for z in ends]) for x, y in corners]
+    bottom, top = ends
+    sides = [np.array([[x, y, bottom], [x, y, top]]) for x, y in corners]
     return [*(circle_line(radius, z) for z in ends), *sides]
 
 

@@ -110,7 +110,8 @@ class SurfaceSection(ShellKeys, MaterialSection):
         if are_texts == {False} and [*numbers_with_units(profile, data.get("profile"), "profile")]:
             raise ValueError(f"{all_or_none}: {', '.join(measured)} has none")
         modulus = section.youngs_modulus
-        if are_texts == {True} and modulus is not None and not 1 <= modulus <= 1e13:
+        is_modulus_allowed = modulus is None or 1 <= modulus <= 1e13
+        if are_texts == {True} and not is_modulus_allowed:
             raise ValueError(
                 f"shell.youngs_modulus: {lengths['youngs_modulus']!r}: "
                 "allowed are 1 Pa to 1e13 Pa (MPa: megapascal, mPa: millipascal)"
@@ -339,6 +340,13 @@ class TorusSurface(RoundSection):
         return self.tube is None
 
 
+def _meets_axis_early(r: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
+    """Return whether a profile with these radii is on or beyond the axis, except at its end."""
+    if r.max() <= 0 or r[-1] < 0:
+        return True
+    return bool((r[:-1] <= 0).any())
+
+
 class ProfileSection(Section):
     """A smooth curve (r, z) through points, or r as a formula of z (in the case's lengths)."""
 
@@ -360,7 +368,7 @@ class ProfileSection(Section):
         ):
             raise ValueError("give points, or radius (a formula of z) and heights")
         r = self.curve[:, 0]
-        if not np.isfinite(self.curve).all() or r.max() <= 0 or (r[:-1] <= 0).any() or r[-1] < 0:
+        if not np.isfinite(self.curve).all() or _meets_axis_early(r):
             raise ValueError(
                 "r must be positive along the profile; only its end may lie on the axis, as a pole"
             )

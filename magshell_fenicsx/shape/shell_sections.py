@@ -204,7 +204,8 @@ class ShellSection(ShellKeys, OneShape):
             )
         if (self.width is None) == (self.geometry == "strip"):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
-        if self.density is not None and (self.youngs_modulus is None or self.radius is None):
+        has_no_units = self.youngs_modulus is None or self.radius is None
+        if self.density is not None and has_no_units:
             raise ValueError(
                 "density turns frequencies into hertz: "
                 "that needs youngs_modulus, radius and thickness"

@@ -105,9 +105,11 @@ def common_mirror(
     vectors = [v for part in parts for v in part.vectors]
     units = [unit(v) for v in vectors]  # candidates of an outline contain these, if possible
 
+    def is_allowed(plane: Mirror) -> bool:
+        return all(part.mirrors(plane) for part in parts)
+
     def first_allowed(planes: Sequence[Mirror]) -> Mirror | None:
-        allowed = (plane for plane in planes if all(part.mirrors(plane) for part in parts))
-        return next(allowed, None)
+        return next((plane for plane in planes if is_allowed(plane)), None)
 
     planes_through_axis = _planes_through_axis(parts, vectors) if outline.round else []
     # the second argument of `mirrors`: whether triangles of a mesh file need not be symmetric
@@ -165,8 +167,9 @@ def common_sector(
     for begin in begins:
         sector = Sector.from_azimuth(begin, waves)
         planes = sector.planes.values()
-        is_allowed = all(part.mirrors(plane) for part in parts for plane in planes)
-        if is_allowed and (outline.round or _ends_at_symmetry_plane(outline, sector)):
+        if not all(part.mirrors(plane) for part in parts for plane in planes):
+            continue
+        if outline.round or _ends_at_symmetry_plane(outline, sector):
             return sector
     return None
 
@@ -236,12 +239,13 @@ def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> Sym
 
     reason, meridian = outline.why_no_meridian, outline.meridian
     # a surface that has a meridian may still have a thickness that differs around e3
-    if reason is None and not (outline.round or meridian):
-        reason = f"not with a {geometry} that is not closed around e3"
-    elif reason is None and not meridian:
+    if meridian:
+        if isinstance(factor, str) and not scalar_is_axisymmetric(factor, meridian):
+            reason = "the thickness differs around e3"
+    elif reason is None and outline.round:
         reason = "the section of the tube is closed: it has no edge to hold it by"
-    elif isinstance(factor, str) and meridian and not scalar_is_axisymmetric(factor, meridian):
-        reason = "the thickness differs around e3"
+    elif reason is None:
+        reason = f"not with a {geometry} that is not closed around e3"
     return SymmetryConstraint(reason, mirrors=mirrors)
 
 
@@ -283,7 +287,8 @@ def points_constraint(
 
     def mirrors(mirror: Mirror) -> bool:
         # a round surface is charted from any plane through e3, and the reported point lies on it
-        if outline.round and mirror.through_e3 and not named_places:
+        is_plane_of_round_surface = outline.round and mirror.through_e3
+        if is_plane_of_round_surface and not named_places:
             return True
         return all(float(mirror.signed_distance(x)) > -ROUNDING for x in places)
 

@@ -430,13 +430,15 @@ class MeridianModel(ThinModel):
         Then the forms cannot serve another problem.
         """
         # terms with data that follow the state
-        follows_state = (
-            self.growing
-            or self.contacts
-            or self.loads.pairs
-            or self.fields
-            or self.factory.saturated
-            or self.loads.moves
+        follows_state = any(
+            (
+                self.growing,
+                self.contacts,
+                self.loads.pairs,
+                self.fields,
+                self.factory.saturated,
+                self.loads.moves,
+            )
         )
         # energies whose numbers are not the parameters of a density
         has_other_numbers = any(e.density is None or e.reference_turn for e in self.energies)

@@ -221,8 +221,9 @@ class ModelBase:
         """
         moving = self.system.moving
         swept_by_lids = 0.0
-        if mu and moving and moving.edge_pressure:
-            swept_by_lids = moving.edge_pressure.swept_volume(mu)
+        edge_pressure = moving.edge_pressure if moving else None
+        if mu and edge_pressure:
+            swept_by_lids = edge_pressure.swept_volume(mu)
         at_state = self.system.at_state(State(u, dict(mu or {})))
         return self.multiplicity * (at_state.integral(self._volume) + swept_by_lids)
 

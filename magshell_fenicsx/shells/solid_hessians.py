@@ -189,6 +189,14 @@ class BodyHessianIntegral:
             """Return three numbers of a point field, from `start` on, as a vector."""
             return ufl.as_vector([f[start + c] for c in range(3)])
 
+        def derivatives(c: int) -> list[Any]:
+            """Return the derivatives of the component c of u by the reference coordinates."""
+            return [z[3 * part + c] for part in range(1, JET_PARTS)]
+
+        def inverse_row(i: int) -> list[Any]:
+            """Return a row of the inverse that makes dX from these derivatives."""
+            return [g[INVERSE + 3 * i + j] for j in range(3)]
+
         def hessian_density(W: Any) -> Any:
             """Return the function whose Hessian by v is wanted, from an energy or a work W."""
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
@@ -201,10 +209,8 @@ class BodyHessianIntegral:
                 function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
         # du/dX from the derivatives by reference coordinates
-        by_reference = ufl.as_matrix(
-            [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
-        )
-        inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
+        by_reference = ufl.as_matrix([derivatives(c) for c in range(3)])
+        inverse = ufl.as_matrix([inverse_row(i) for i in range(3)])
         # arguments X, u and H; on ends n and t; then parameters
         frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.region == "end" else []
         W = function(

@@ -909,11 +909,12 @@ def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem
     `tangents` and `increments` (12,) add up to both tangents of the edge's cell and of the other
     one. The first two components of `edge_direction` give the edge in the coordinates of its cell.
     """
+
+    def tangent(i: int) -> Expr:
+        return ufl.as_vector([tangents[3 * i + c] + increments[3 * i + c] for c in range(3)])
+
     # tangents of the edge's cell (a) and of the other one (b)
-    a1, a2, b1, b2 = (
-        ufl.as_vector([tangents[3 * i + c] + increments[3 * i + c] for c in range(3)])
-        for i in range(4)
-    )
+    a1, a2, b1, b2 = (tangent(i) for i in range(4))
 
     def unit(v: Expr) -> Expr:
         return v / ufl.sqrt(ufl.dot(v, v))

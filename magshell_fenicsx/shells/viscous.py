@@ -601,7 +601,7 @@ def _work_on_interior_edges(
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     sides = ("+", "-")
-    r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
+    r0s, us = [r0.side(s) for s in sides], [u.side(s) for s in sides]
     conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
 
     def jump_of(r: Jet) -> Expr:

@@ -345,12 +345,8 @@ class Waves:
                 self._ranges.append(wave_range)
                 continue
             # the first and the last of the Bernstein coefficients are the matrices of these waves
-            all_are_definite = (
-                is_definite_wave(first)
-                and is_definite_wave(last)
-                and all(is_definite(weights) for weights in wave_range.inner)
-            )
-            if all_are_definite:
+            ends_are_definite = is_definite_wave(first) and is_definite_wave(last)
+            if ends_are_definite and all(is_definite(weights) for weights in wave_range.inner):
                 self._ranges.append(wave_range)
             else:
                 open_ranges += wave_range.halves(self._nodes)

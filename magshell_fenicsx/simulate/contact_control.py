@@ -134,22 +134,20 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
     for contact in scene.problem.loads.contacts:
         stiffness = state.mu.get(contact.setting, contact.stiffness)
         depth = scene.model.region(state, contact.amplitude).penetration  # over R
-        if (
-            depth > contact.max_penetration * h
-            and not contact.has_given_stiffness
-            and stiffness < MAX_STIFFENING * contact.stiffness
-        ):
+        is_too_deep = depth > contact.max_penetration * h
+        is_below_limit = stiffness < MAX_STIFFENING * contact.stiffness
+        may_rise = is_below_limit and not contact.has_given_stiffness
+        if is_too_deep and may_rise:
             settings[contact.setting] = STIFFENING * stiffness
     # shells on each other
     for pair, depth in shell_penetrations(scene, state):  # depth over the thickness
         stiffness = state.mu.get(pair.setting, pair.stiffness)
         # depths are those at points of contact; between these shells may be deeper, so that only
         # a part of the bound is allowed
-        if (
-            depth > BOUND_AT_POINTS * pair.max_penetration
-            and not pair.has_given_stiffness
-            and stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
-        ):
+        is_too_deep = depth > BOUND_AT_POINTS * pair.max_penetration
+        is_below_limit = stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
+        may_rise = is_below_limit and not pair.has_given_stiffness
+        if is_too_deep and may_rise:
             settings[pair.setting] = STIFFENING * stiffness
     return settings
 
@@ -559,7 +557,8 @@ def _displacement_at(
     """
     mu_a, mu_b = earlier_point.state.mu[name], later_point.state.mu[name]
     is_outside = (value - mu_a) * (value - mu_b) > 0
-    if is_outside or not earlier_point.dmu or not later_point.dmu:
+    has_infinite_slope = not earlier_point.dmu or not later_point.dmu
+    if is_outside or has_infinite_slope:
         return None
     slope_a, slope_b = earlier_point.du / earlier_point.dmu, later_point.du / later_point.dmu
     polynomial = scipy.interpolate.CubicHermiteSpline(

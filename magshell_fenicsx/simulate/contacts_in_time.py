@@ -102,11 +102,8 @@ class ContactsInTime:
             pair = contact.pair
             stiffness = begin.mu.get(pair.setting, pair.stiffness)
             needed_stiffness = stiff_for(pair, speed, self._system.length)
-            if (
-                needed_stiffness > stiffness
-                and not pair.has_given_stiffness
-                and evaluation.evaluate(contact.penetration) <= 0
-            ):
+            may_be_too_soft = needed_stiffness > stiffness and not pair.has_given_stiffness
+            if may_be_too_soft and evaluation.evaluate(contact.penetration) <= 0:
                 settings[pair.setting] = needed_stiffness
         return settings
 

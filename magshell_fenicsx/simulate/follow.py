@@ -105,7 +105,8 @@ def follow(
         begin, state, scene = state, run.end, run.scene
         if search and step.load.search:
             yield from _search_records(scene, step, begin, state)
-        if step is not steps[-1] and step.until in ("limit", "bifurcation") and run.is_at_event:
+        ends_at_event = step.until in ("limit", "bifurcation") and run.is_at_event
+        if step is not steps[-1] and ends_at_event:
             raise Stopped(
                 f"{run.place}ends at a {run.label}, from which the next step cannot start"
             )
@@ -185,7 +186,8 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
         pivots = scene.newton.factor_at(state).negative_pivots
     clock = dict[str, float]()
     steps = scene.problem.programme
-    if steps and (first_motion := steps[0].load.motion) and not has_rise:
+    first_motion = steps[0].load.motion if steps else None
+    if first_motion and not has_rise:
         from magshell_fenicsx.simulate.transient import initial_clock
 
         clock = initial_clock(scene, first_motion, state)
@@ -268,8 +270,9 @@ class _StepRun:
             self.is_unstable = True
             # an excluded mode may have become unstable before, at a point that was not located
             is_uncertain = bool(self.scene.stability_monitor.unlocated)
-            if not (self._first_instability or record.branch or is_uncertain):
-                self._first_instability = record
+            if record.branch or is_uncertain:
+                continue
+            self._first_instability = self._first_instability or record
         self.end = stream.end
 
     def remark_on_release(self) -> str:
@@ -281,8 +284,11 @@ class _StepRun:
             If a shell is released elsewhere than at a fold or a bifurcation of its path.
         """
         fold = self._last
-        # nothing is released, or in the larger model, which has the mode of the bifurcation
-        if not (self._step.load.released_by and fold) or self._is_released_at_bifurcation:
+        # nothing is released
+        if not (self._step.load.released_by and fold):
+            return ""
+        # it is released in the larger model, which has the mode of the bifurcation
+        if self._is_released_at_bifurcation:
             return ""
         if fold.label != "fold" or fold.mode:  # a mode: one that the model excludes
             raise Stopped(

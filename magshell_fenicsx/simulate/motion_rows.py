@@ -453,11 +453,13 @@ class MotionRows:
         # beside a body factors belong to a whole step: each interval makes its own
         if self.integrator.contact:
             self.integrator.factored_state = None
+        if not factored_point:
+            return
         # s is the time step of the factors, 0 if there were none
-        if factored_point and factored_point.s and not self.integrator.contact:
+        if factored_point.s and not self.integrator.contact:
             state = factored_point.state
             self.integrator.factor(
                 FactoredState(state.u, dict(state.mu), factored_point.s, factored_point.habit)
             )
-        elif factored_point:  # the choice of the solver alone
+        else:  # the choice of the solver alone
             self.integrator.factorisation.habit = factored_point.habit

@@ -46,7 +46,8 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         If magnetised parts intersect.
     """
     loads = problem.loads
-    if not (loads.pairs or loads.joints or loads.interaction) or cells > MAX_CELLS:
+    may_overlap = any((loads.pairs, loads.joints, loads.interaction))
+    if not may_overlap or cells > MAX_CELLS:
         return
     if problem.axisymmetric:
         _refuse_overlap_on_meridian(problem)

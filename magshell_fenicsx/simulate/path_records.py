@@ -263,7 +263,8 @@ class _Checks:
             high.has_instability_since(low) or low.negative_pivots != self._pivots_at_begin
         )
         # cuts with closer points of contact, where these would change the instability
-        needs_closer_points = has_instability and not (stiffer or cuts)
+        is_unchanged = not (stiffer or cuts)
+        needs_closer_points = has_instability and is_unchanged
         closer = closer_points(stage, low, high) if needs_closer_points else {}
         return RecordedValues({"stiffer": stiffer, "cuts": cuts or closer})
 
@@ -387,7 +388,8 @@ class _StageRecords:
             self._is_final = e.final
         # crossings on the last part of the way, after the monitor's last evaluation
         excluded = list(_excluded_records(stage, path, self._monitor.end()))
-        if excluded and self._stop_reason and goal.until == "bifurcation":
+        has_reached_goal = excluded and goal.until == "bifurcation"
+        if has_reached_goal and self._stop_reason:
             yield excluded[0]
             self._stop_reason = ""  # the goal lies before the stop
             return True

@@ -324,7 +324,9 @@ def target_ratios(
         old.problem.programme[:steps], new.problem.programme[:steps], strict=True
     ):
         old_target, new_target = step.load.target, new_step.load.target
-        if not (old_target and new_target) or old_target[0].quantity != quantity:
+        if not (old_target and new_target):
+            continue
+        if old_target[0].quantity != quantity:
             continue
         (_, old_value), (_, new_value) = old_target, new_target
         if old_value and old_value != new_value:
@@ -338,13 +340,10 @@ def same_chart_bounds(shape: object, other: object) -> bool:
     A chart with other bounds needs another mesh.
     """
     bounds, other_bounds = chart_bounds(shape), chart_bounds(other)
-    return (
-        bounds is None
-        or other_bounds is None
-        or (
-            np.allclose(bounds[0], other_bounds[0], 0, 1e-14)
-            and np.allclose(bounds[1], other_bounds[1], 0, 1e-14)
-        )
+    if bounds is None or other_bounds is None:
+        return True
+    return np.allclose(bounds[0], other_bounds[0], 0, 1e-14) and np.allclose(
+        bounds[1], other_bounds[1], 0, 1e-14
     )
 
 

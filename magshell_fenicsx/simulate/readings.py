@@ -248,7 +248,9 @@ class PrescribedQuantity:
         # a target is a pair of what it prescribes and its value
         old_target, new_target = self.step.load.target, other.programme[-1].load.target
         quantity = "conjugate" if self.by_conjugate else "load"
-        if not (old_target and new_target and old_target[0].quantity == quantity):
+        if not (old_target and new_target):
+            return 1.0
+        if old_target[0].quantity != quantity:
             return 1.0
         (_, old_value), (_, new_value) = old_target, new_target
         return new_value / old_value if old_value else 1.0
@@ -289,7 +291,8 @@ class ResultSampler:
                 self._records.append(record)
                 if places_ahead and record.step == last_step:
                     places_ahead -= self._just_passed(places_ahead)
-                if record.step == last_step and not places_ahead and not to_end:
+                is_complete = not places_ahead and not to_end
+                if record.step == last_step and is_complete:
                     break
         except Stopped as e:
             self._stop_reason = str(e)

@@ -424,8 +424,10 @@ class Scene:
         )
         # the mesh that a program has given, if it has
         mesh_file = self.problem.mesh_file
-        user_mesh = mesh_file.user_mesh if mesh_file else None
-        if not (surface and mesh_file and user_mesh):
+        if not (surface and mesh_file):
+            return displacement
+        user_mesh = mesh_file.user_mesh
+        if not user_mesh:
             return displacement
         if self.problem.is_half:
             raise ValueError(
@@ -462,7 +464,8 @@ class Scene:
         # first steps of a path
         further_amplitudes = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
         missing_amplitudes = unloaded.mu.keys() - state.mu.keys()
-        if missing_amplitudes or (further_amplitudes and not allows_more):
+        has_too_many = further_amplitudes and not allows_more
+        if missing_amplitudes or has_too_many:
             names_of_state, names_of_scene = (
                 ", ".join(sorted(mu)) or "none" for mu in (state.mu, unloaded.mu)
             )

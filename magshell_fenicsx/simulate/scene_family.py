@@ -27,6 +27,7 @@ from functools import cached_property
 from math import isclose
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.augmented import BoundaryPoint, Kind, NoSystem
 from magshell_fenicsx.continuation.boundary import BoundaryLost
@@ -318,7 +319,8 @@ class SceneFamily:
         for earlier in earlier_steps:
             # a target is a pair of what it prescribes and its value
             target = earlier.load.target or earlier.load.limit_target
-            if earlier.load.hold or (target and target[0].quantity == "conjugate"):
+            ends_at_conjugate = target and target[0].quantity == "conjugate"
+            if earlier.load.hold or ends_at_conjugate:
                 raise CaseError(
                     f"{earlier.key}: ends at a displacement or a volume, so its load changes along "
                     "a boundary"
@@ -588,18 +590,19 @@ class SceneFamily:
             old_target, new_target = (
                 step.load.target or step.load.limit_target for step in (old_step, new_step)
             )
-            if not (old_target and new_target) or old_target[0].quantity != "load":
+            if not (old_target and new_target):
+                continue
+            if old_target[0].quantity != "load":
                 continue
             # a later step may have moved it away from the target
             if isclose(mu.get(old_step.name, np.nan), old_target[1], rel_tol=1e-9):
                 mu[old_step.name] = new_target[1]
         # at the initial value
         old_values, new_values = own_amplitudes(old.loads), own_amplitudes(new.loads)
-        mu |= {
-            name: new_values[name]
-            for name, value in old_values.items()
-            if name in new_values and value and mu.get(name) == value
-        }
+        names_at_initial_value = [
+            name for name, value in old_values.items() if value and mu.get(name) == value
+        ]
+        mu |= {name: new_values[name] for name in names_at_initial_value if name in new_values}
         # components of the magnetic field
         if old.lambda_m and new.lambda_m != old.lambda_m:
             strength_ratio = new.lambda_m / old.lambda_m
@@ -717,12 +720,23 @@ def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
         return replace(on_mesh, meridian=replace(on_mesh.meridian, vertices=moved_vertices))
     if scene.model.midsurface and not same_chart_bounds(old.shape, new.shape):
         patch = scene.model.midsurface.with_embedding(new.embedding)
-        old_bounds, new_bounds = chart_bounds(old.shape), chart_bounds(new.shape)
-        # nodes of a mesh file have three coordinates
-        if old_bounds is None or new_bounds is None or patch.nodes.shape[1] != 2:
+        nodes = _moved_nodes(patch.nodes, old.shape, new.shape)
+        if nodes is None:
             raise NoSystem("the mesh of this shape cannot move with the number")
-        (old_low, old_high), (new_low, new_high) = old_bounds, new_bounds
-        old_size, new_size = old_high - old_low, new_high - new_low
-        nodes = new_low + (patch.nodes - old_low) / old_size * new_size
         return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
     return on_mesh
+
+
+def _moved_nodes(
+    nodes: NDArray[np.float64], old_shape: object, new_shape: object
+) -> NDArray[np.float64] | None:
+    """Return nodes that move linearly with the bounds of a chart; None if they cannot."""
+    old_bounds, new_bounds = chart_bounds(old_shape), chart_bounds(new_shape)
+    if old_bounds is None or new_bounds is None:
+        return None
+    if nodes.shape[1] != 2:  # nodes of a mesh file have three coordinates
+        return None
+    (old_low, old_high), (new_low, new_high) = old_bounds, new_bounds
+    old_size, new_size = old_high - old_low, new_high - new_low
+    moved_nodes: NDArray[np.float64] = new_low + (nodes - old_low) / old_size * new_size
+    return moved_nodes

@@ -72,8 +72,10 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
     # without data, as of a problem that a program has made, nothing can be compared
     if not (old.document.data and has_same_data):
         return False
-    # models with contacts or dead loads are always built anew
-    if not model.thin or model.contacts or model.shell_contacts or old.loads.dead:
+    # solids, and models with contacts or dead loads, are always built anew
+    if not model.thin or old.loads.dead:
+        return False
+    if model.contacts or model.shell_contacts:
         return False
     old_symmetry, new_symmetry = (
         (each.axisymmetric, each.mirror, each.azimuth) for each in (old, problem)
@@ -94,11 +96,15 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
 def _data_without_fields(problem: Problem) -> dict[str, Any]:
     """Return the data of a problem's case, key by key, without the fields that a scene can take."""
     return {
-        key: {name: value for name, value in section.items() if name not in FIELD_KEYS[key]}
-        if key in FIELD_KEYS
-        else section
-        for key, section in problem.document.data.items()
+        key: _section_without_fields(key, section) for key, section in problem.document.data.items()
     }
+
+
+def _section_without_fields(key: str, section: Any) -> Any:
+    """Return the data of the section `key` without the fields that a scene can take."""
+    if key not in FIELD_KEYS:
+        return section
+    return {name: value for name, value in section.items() if name not in FIELD_KEYS[key]}
 
 
 def _kinds_of_fields(problem: Problem) -> tuple[bool | str | float, ...]:
@@ -120,8 +126,9 @@ def _has_fields_by_patch(problem: Problem) -> bool:
     has_natural_patches = natural is not None and any(
         isinstance(field, Mapping) for field in (natural.curvature, natural.stretch)
     )
-    has_patches = (magnetic and magnetic.patches) or (thickness and thickness.patches)
-    return has_natural_patches or bool(has_patches)
+    magnetic_patches = magnetic and magnetic.patches
+    thickness_patches = thickness and thickness.patches
+    return has_natural_patches or bool(magnetic_patches or thickness_patches)
 
 
 def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:

@@ -206,7 +206,9 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         Fold with a state of the model.
     """
     field = scene.model.loads.magnetic
-    if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
+    if field is None or scene.model.loads.interaction:
+        return {}
+    if field.soft and field.soft.alone:
         return {}
     rims_by_patch = scene.problem.within
     if field.patches and scene.problem.context.sections.get("shells"):
@@ -363,7 +365,8 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
         Number of the section, such as "width" or "at.polar".
     """
     # the depth of a dimple, its amplitude, leaves the rim where it is
-    if section.patch and problem.patched and name != "amplitude":
+    has_rim = section.patch and problem.patched
+    if has_rim and name != "amplitude":
         return False
     if not name.startswith("at."):  # it is no number of the centre
         return True

@@ -113,15 +113,17 @@ class SharedForms:
 
 def _shapes(numbers: Numbers) -> list[tuple[str, list[tuple[int, ...]]]]:
     """Return the shapes of the numbers of each term, by name."""
-    return [
-        (name, [np.shape(number) for number in numbers_of_term])
-        for name, numbers_of_term in numbers.items()
-    ]
+    return [(name, _shapes_in_term(numbers_of_term)) for name, numbers_of_term in numbers.items()]
+
+
+def _shapes_in_term(numbers_of_term: list[Array]) -> list[tuple[int, ...]]:
+    """Return the shapes of the numbers of one term."""
+    return [np.shape(number) for number in numbers_of_term]
 
 
 def _copied(numbers: Numbers) -> Numbers:
     """Return a copy of the numbers of all terms."""
-    return {
-        name: [np.array(number) for number in numbers_of_term]
-        for name, numbers_of_term in numbers.items()
-    }
+    copies: Numbers = {}
+    for name, numbers_of_term in numbers.items():
+        copies[name] = [np.array(number) for number in numbers_of_term]
+    return copies

@@ -83,8 +83,9 @@ class Stage:
         """
         system: System = scene.model.system
         device = self.device.for_system(system) if self.device else None
-        parametrised = self.parametrised.for_system(device or system) if self.parametrised else None
-        newton = scene.newton.for_system(parametrised or device or system)
+        inner_system: System = device or system
+        parametrised = self.parametrised.for_system(inner_system) if self.parametrised else None
+        newton = scene.newton.for_system(parametrised or inner_system)
         return Stage(scene, newton, device, parametrised)
 
     def padded(self, u: Vector) -> Vector:

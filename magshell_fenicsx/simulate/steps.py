@@ -102,7 +102,8 @@ def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepC
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     path = _with_step_options(scene, path, course, drive)
     is_to_target = course.until == "target" or load.limit_target
-    if drive.end is not None and not drive.targets and is_to_target:  # it is there already
+    is_at_end = drive.end is not None and not drive.targets
+    if is_at_end and is_to_target:
         yield Record("target", step.name, stage.point(start))
         return state
     goal = ContinuationGoal(
@@ -112,21 +113,30 @@ def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepC
     forbidden, first_instability = "", None
     for record in stream:
         is_located = record.label in LOCATED
-        if is_located and not record.branch and first_instability is None:
+        is_instability_of_path = is_located and not record.branch
+        if is_instability_of_path and first_instability is None:
             first_instability = record
         yield replace(record, label=course.label) if course.label and not is_located else record
-        if is_located and course.forbidden and not forbidden:
-            # words for an instability that the step does not allow, or ""
-            forbidden = course.forbidden(record.point.state.mu, record.mode or record.label)
+        if is_located and not forbidden:
+            forbidden = _words_if_forbidden(course, record)
         if forbidden and course.at_once:
             raise Stopped(forbidden)
     if forbidden or limit_reason:
         raise Stopped(forbidden or limit_reason)
-    if load.branch_points and first_instability and is_symmetry_breaking(first_instability):
+    if not (load.branch_points and first_instability):
+        return stream.end
+    if is_symmetry_breaking(first_instability):
         branch_goal, scale = off_path(goal, load.branch_points), abs(drive.scale)
         # as branch 1, beside the path of the step
         yield from follow_switched_branch(stage, first_instability, branch_goal, scale, number=1)
     return stream.end
+
+
+def _words_if_forbidden(course: StepCourse, record: Record) -> str:
+    """Return words for an instability if its step does not allow it; "" if it does."""
+    if not course.forbidden:
+        return ""
+    return course.forbidden(record.point.state.mu, record.mode or record.label)
 
 
 def _within_support_limits(
@@ -214,9 +224,9 @@ def symmetry_switch_of_step(
 
 def leaves_path(step: ProgrammeStep) -> bool:
     """Return whether a step leaves its path at its bifurcation, for a branch or a snap."""
-    return step.until == "bifurcation" and (
-        step.load.follows_branch or step.load.released_by is not None
-    )
+    if step.until != "bifurcation":
+        return False
+    return step.load.follows_branch or step.load.released_by is not None
 
 
 def is_symmetry_breaking(record: Record) -> bool:

@@ -88,7 +88,7 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
     unit, scale = scene.sizes.unit(column), quantity(column).scale
     # conjugates with a unit: the change of volume of a pressure, the displacement of a force
     forces = (*scene.model.loads.forces, *scene.model.contacts)
-    may_have_unit = of_load or name == "pressure" or name in forces
+    may_have_unit = of_load or name in ("pressure", *forces)
     # in a case without units, any unit of the quantity shows that a text could have one
     any_unit = next((unit_of_quantity.text for unit_of_quantity in quantity(column).units), "")
     text = unit.text if unit else any_unit
@@ -165,16 +165,18 @@ def trace(  # noqa: PLR0913
         raise ValueError(
             f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}"
         )
-    of_load = control == "load" or (control == "arc" and quantity == "load")
+    quantity_of_targets = quantity if control == "arc" else control
+    of_load = quantity_of_targets == "load"
     targets = target_values(scene, name, "targets", targets, of_load=of_load)
     # one amount gives one number
     first = None if first is None else target_values(scene, name, "first", first, of_load=True)[0]
     if until == "target" and not targets:
         raise ValueError("trace: until='target' needs targets")
-    if first is None and targets and of_load:
-        first = (targets[-1] - state.mu[name]) / 10
-    if first is None and targets and control == "conjugate":
-        first = 1.0  # the targets determine the step length
+    if first is None and targets:
+        if of_load:
+            first = (targets[-1] - state.mu[name]) / 10
+        elif control == "conjugate":
+            first = 1.0  # the targets determine the step length
     if not first:
         raise ValueError(
             f"trace: {name}: give first, the change of the amplitude in the first step, not zero"

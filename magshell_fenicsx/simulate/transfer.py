@@ -233,12 +233,10 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
         spherical = (
             isinstance(embedding, DeviatedEmbedding) and embedding.perfect is sphere_embedding
         )
-        if (  # only spheres with one dimple about the pole
-            not spherical
-            or not isinstance(shape, DiscShape)
-            or len(shape.circles) != 1
-            or shape.rims
-        ):
+        # only spheres with one dimple about the pole
+        if not spherical or not isinstance(shape, DiscShape):
+            return None
+        if len(shape.circles) != 1 or shape.rims:
             return None
         rims.append(shape.circles[0])
         edges.append(shape.radius)

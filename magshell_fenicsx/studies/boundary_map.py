@@ -31,6 +31,13 @@ FOLDER = Folder(
 )
 
 
+def _is_another_number(axis: Axis, first: str) -> bool:
+    """Return whether an axis is one number of the shell or its loads, other than the first key."""
+    if len(axis.keys) > 1 or axis.numbers is None:
+        return False
+    return axis.name != first and axis.name.split(".")[0] not in KEYS_OUTSIDE_THE_MODEL
+
+
 def second_axis(text: str, first: str) -> Axis:
     """Read the second `--over` of a map.
 
@@ -45,13 +52,7 @@ def second_axis(text: str, first: str) -> Axis:
         If the text is no list of numbers of one other key, each once.
     """
     axis = parse_axis(text)
-    # one other number of the shell or its loads
-    if (
-        len(axis.keys) > 1
-        or axis.numbers is None
-        or axis.name == first
-        or axis.name.split(".")[0] in KEYS_OUTSIDE_THE_MODEL
-    ):
+    if not _is_another_number(axis, first):
         raise CaseError(
             f"--over {text}: the second key of a map is another number of the shell or its loads, "
             "written as "
@@ -239,9 +240,5 @@ def _write(stability_map: StabilityBoundary, folder: Path) -> None:
     )
     columns = ("second", "amplitude", *COLUMNS, *extra_columns)
     write_object(folder / "map.json", stability_map.content)
-    write_csv(
-        [{name: row.get(name, "") for name in columns} for row in stability_map.rows],
-        columns,
-        folder / "boundary.csv",
-    )
+    write_csv(stability_map.rows, columns, folder / "boundary.csv")
     draw_map(stability_map.rows, stability_map.content, folder / "boundary.png")

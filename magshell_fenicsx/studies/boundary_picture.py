@@ -113,9 +113,8 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     rows_of_other_loads = [row for row in rows if row["amplitude"] != content["load"]]
     values_without_boundary = sorted(set(content["values"]) - {row["second"] for row in rows})
     # the second panel, if there is something to show in it
-    with_plane = bool(
-        rows_of_other_loads or values_without_boundary or any(row["kind"] in MARKS for row in rows)
-    )
+    has_special_rows = bool(rows_of_other_loads) or any(row["kind"] in MARKS for row in rows)
+    with_plane = has_special_rows or bool(values_without_boundary)
     width_inches = 10.2 if with_plane else 6.4
     figure, plots = plt.subplots(
         1, 1 + with_plane, figsize=(width_inches, 4.4), layout="constrained", squeeze=False
@@ -245,11 +244,12 @@ def _arms(
     if cusp_number is None:
         return None
     # from the cusp back to the first row, and on to the last one
-    first_arm, second_arm = (
-        [(row["key"], row["load"]) for row in part]
-        for part in (rows[cusp_number::-1], rows[cusp_number:])
-    )
-    return first_arm, second_arm
+    return _places(rows[cusp_number::-1]), _places(rows[cusp_number:])
+
+
+def _places(rows: Sequence[Row]) -> list[tuple[float, float]]:
+    """Return the places (key, load) of rows."""
+    return [(row["key"], row["load"]) for row in rows]
 
 
 def _regions(
@@ -341,15 +341,15 @@ def _regions_of_mode(
 def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     """Return the modes along the boundary, each with its rows and the crossings at their ends."""
     crossing_numbers = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
+    parts = list[tuple[str, list[Row]]]()
     # a crossing belongs to the parts on both sides
-    row_groups = ([*rows[a : b + 1]] for a, b in pairwise([0, *crossing_numbers, len(rows) - 1]))
-    # the mode of a part is that of its first row that is no crossing
-    mode_parts = (
-        (next((row["mode"] for row in row_group if row["kind"] != "crossing"), None), row_group)
-        for row_group in row_groups
-    )
-    # a part of crossings alone has no mode
-    return [(mode, row_group) for mode, row_group in mode_parts if mode is not None]
+    for begin, end in pairwise([0, *crossing_numbers, len(rows) - 1]):
+        row_group = [*rows[begin : end + 1]]
+        # the mode of a part is that of its first row that is no crossing
+        mode = next((row["mode"] for row in row_group if row["kind"] != "crossing"), None)
+        if mode is not None:  # a part of crossings alone has no mode
+            parts.append((mode, row_group))
+    return parts
 
 
 def _mode(mode: str) -> str:

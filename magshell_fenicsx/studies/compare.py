@@ -311,13 +311,18 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     ]
 
 
+def _has_target(run: ModelRun) -> bool:
+    """Return whether a run has reached a target while its load varied."""
+    return any(row["label"] == "target" for row in loaded(run))
+
+
 def places(runs: Sequence[ModelRun]) -> list[float]:
     """Return the displacements w/h = 1, 2, ... that all runs reach.
 
     If the last common displacement is below 1, the list has that alone. It is empty if a run has no
     targets: its steps are too long to interpolate between them.
     """
-    if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
+    if not all(_has_target(run) for run in runs):
         return []
     end = min(max(curve(run)[0]) for run in runs)
     # the tolerance is for an end that is a whole number but for rounding
@@ -484,13 +489,15 @@ def compare(
         judged_place = max(places([run for model in MODELS for run in runs[model]]), default=None)
         content = {"case": file.name, **_content(runs, judged_place, curve_differences, scalar)}
         access_disk(MPI.COMM_SELF, lambda: _write(content, curve_differences, folder))
-        errors: Errors = {
-            model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]]
-            for model in MODELS
-        }
+        errors: Errors = {model: _errors_of(content["runs"][model]) for model in MODELS}
         title = f"{file.name} {' '.join(settings)}".strip()
         draw_comparison(shell, solid, curve_differences, errors, title, folder / "compare.png")
     return Comparison(curve_differences, content)
+
+
+def _errors_of(runs: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
+    """Return error and CPU time of those runs of compare.json that have an error."""
+    return [(run["error"], run["cpu_s"]) for run in runs if run["error"]]
 
 
 def _refuse_incomparable(file: Path, settings: Sequence[str], make_case: MakeCase) -> None:
@@ -505,11 +512,8 @@ def _refuse_incomparable(file: Path, settings: Sequence[str], make_case: MakeCas
         case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     # the programme of loads is the same for both models
     load_name = case.programme[-1].name if case.programme else ""
-    if (
-        not load_name
-        or load_name in UNCOMPARED
-        or (load_name == "lambda_m" and case.loading is None)  # a field alone
-    ):
+    is_field_alone = load_name == "lambda_m" and case.loading is None
+    if is_field_alone or load_name in ("", *UNCOMPARED):
         raise CaseError(
             "compare: needs a load whose curve can be compared: pressure, indentation or field"
         )

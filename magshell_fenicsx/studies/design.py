@@ -502,8 +502,8 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
     else:
         keys_and_values = enumerate(part if isinstance(part, list) else [])
     for key, value in keys_and_values:
-        # best.csv is in the new folder already
-        if key == "file" and isinstance(value, str) and value != "best.csv":
+        is_file_name = key == "file" and isinstance(value, str)
+        if is_file_name and value != "best.csv":  # which is in the new folder already
             part[key] = os.path.relpath(old / value, new)
         _from_here(value, old, new)
 

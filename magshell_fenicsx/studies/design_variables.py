@@ -412,6 +412,14 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     return Vectors(controls, start, lengths=(low, high))
 
 
+def _has_influence(case: Case) -> bool:
+    """Return whether the remanence of a case has an influence on any result."""
+    if case.lambda_m or case.sensors:
+        return True
+    # another magnet feels the remanence without an applied field, as a sensor does
+    return case.magnetic is not None and case.magnetic.interaction != "none"
+
+
 def controls_of(
     case: Case, count: int | None, width: float | None, key: str
 ) -> tuple[ControlPoints, Array]:
@@ -438,22 +446,19 @@ def controls_of(
     CaseError
         If no remanence has an influence, or `count` is None and there are no points.
     """
-    magnetic = case.magnetic
-    # a sensor, or another magnet, feels the remanence without an applied field
-    needs_space = case.sensors or (magnetic and magnetic.interaction != "none")
-    if magnetic is None or magnetic.remanent is None or not (case.lambda_m or needs_space):
+    remanent = case.magnetic.remanent if case.magnetic else None
+    if remanent is None or not _has_influence(case):
         raise CaseError(
             f"{key}: the case has no remanence in a field, of a neighbour or that a sensor reads, "
             "so no result "
             "depends on it"
         )
     if count is None:  # a remanence of kind `points` has its own points
-        if not (magnetic.remanent and magnetic.remanent.file):
+        if not remanent.file:
             raise CaseError(f"{key}: give points, or magnetic.remanent of kind: points")
-        places, vectors = read_vectors(
-            magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files
-        )
-        return ControlPoints(places, width or magnetic.remanent.filter or 1.0), vectors
+        places, vectors = read_vectors(remanent.path, "magnetic.remanent.file", remanent.files)
+        width_of_remanent = remanent.filter or 1.0
+        return ControlPoints(places, width or width_of_remanent), vectors
     # points spread over the surface, with the remanence of the case there
     problem = case.problem()
     places, width = _spread(case, problem, count, width)

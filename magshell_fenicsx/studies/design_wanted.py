@@ -267,7 +267,8 @@ class DesignGoal:
         objective = self.section.objective
         # of several results, which are maximised, the lowest counts
         value = min(evaluation.values[result] for result in objective.results)
-        scale = self._objective_scale or abs(value) or 1.0
+        own_scale = abs(value) or 1.0
+        scale = self._objective_scale or own_scale
         if objective.value is not None:
             scale = abs(objective.value) or scale
             difference = value - objective.value
@@ -286,9 +287,9 @@ class DesignGoal:
     def lowest(self) -> bool:
         """Whether the lowest of several results, instabilities or frequencies is maximised."""
         objective = self.section.objective
-        return objective.maximise is not None and (
-            len(objective.results) > 1 or objective.result in LOWEST
-        )
+        if objective.maximise is None:
+            return False
+        return len(objective.results) > 1 or objective.result in LOWEST
 
     @property
     def crossed(self) -> bool:
@@ -305,35 +306,26 @@ class DesignGoal:
         Their number is constant: missing ones are replaced by an upper bound.
         """
         # for each result its value and those next to it, without gradients
-        groups = [
-            _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
-            for result in self.section.objective.results
-        ]
-        return np.asarray(
-            np.concatenate(
-                [[value for value, _ in values_and_slopes] for values_and_slopes in groups]
+        groups = list[list[float]]()
+        for result in self.section.objective.results:
+            values_and_slopes = _value_and_close_ones(
+                evaluation.values[result], evaluation.beside.get(result)
             )
-            / self._objective_scale
-        )
+            groups.append([value for value, _ in values_and_slopes])
+        return np.asarray(np.concatenate(groups) / self._objective_scale)
 
     def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
         """Return the gradients (n, p) of `lowest_values`, in the same order."""
-        results = self.section.objective.results
-        # for each result the pairs of value and gradient, of it and of those next to it
-        groups = [
-            _value_and_close_ones(
+        # for each result its gradient and those of the values next to it
+        groups = list[list[Sequence[float]]]()
+        for result in self.section.objective.results:
+            values_and_slopes = _value_and_close_ones(
                 evaluation.values[result],
                 evaluation.beside.get(result),
                 evaluation.gradients[result],
             )
-            for result in results
-        ]
-        return np.asarray(
-            np.concatenate(
-                [[slope for _, slope in values_and_slopes] for values_and_slopes in groups]
-            )
-            / self._objective_scale
-        )
+            groups.append([slope for _, slope in values_and_slopes])
+        return np.asarray(np.concatenate(groups) / self._objective_scale)
 
     def constraints(self, evaluation: DesignEvaluation) -> Array:
         """Return the scaled slacks of the constraints; negative where one is violated."""
@@ -362,11 +354,10 @@ class DesignGoal:
         It is the absolute bound; without a bound, or with the bound zero, the larger of the two
         results at the start; and 1 if these are zero too.
         """
-        return (
-            abs(limit.bound)
-            or max(self.scale.get(result, 0.0) for result in (limit.of, limit.other))
-            or 1.0
+        scale = abs(limit.bound) or max(
+            self.scale.get(result, 0.0) for result in (limit.of, limit.other)
         )
+        return scale or 1.0
 
     def violation(self, evaluation: DesignEvaluation) -> float:
         """Return the largest relative violation of the constraints; zero if all are satisfied."""

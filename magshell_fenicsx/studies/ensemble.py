@@ -242,9 +242,14 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
     An outcome with an error is not usable: the error may have been one of the machine.
     """
     outcome = stored_outcome_of_case(_file(folder, key))
-    return bool(
-        outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED)
-    )
+    if not outcome or not outcome.serves(scalar):
+        return False
+    return not (outcome.stopped or "").startswith(FAILED)
+
+
+def _has_no_sample_yet(points: Path) -> bool:
+    """Return whether the folder of an ensemble's samples is empty: killed before the first one."""
+    return points.is_dir() and not any(points.glob("*.json"))
 
 
 def _refuse_strange(folders: Sequence[Path], keys: Iterable[str], *, merge: bool) -> None:
@@ -265,12 +270,9 @@ def _refuse_strange(folders: Sequence[Path], keys: Iterable[str], *, merge: bool
         If a folder has none of the samples.
     """
     for folder in folders:
-        points = folder / "points"
-        # killed before its first sample
-        has_no_sample_yet = not merge and points.is_dir() and not any(points.glob("*.json"))
-        if not has_no_sample_yet and not any(
-            stored_outcome_of_case(_file(folder, key)) for key in keys
-        ):
+        if not merge and _has_no_sample_yet(folder / "points"):
+            continue
+        if not any(stored_outcome_of_case(_file(folder, key)) for key in keys):
             raise CaseError(
                 f"{folder}: has no sample of this ensemble that these sources computed: look at "
                 "case, --seed and --set"
@@ -387,13 +389,16 @@ def _outcome_along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outc
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
             result.rows.append(row_maker.row(record, wall_s=0.0))
             # points of the pressure's path alone lead to its fold
-            if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
+            if record.amplitude != "pressure":
+                continue
+            if record.mode or record.label == "bifurcation":
                 continue
             # the guess is the point itself if it is a fold; a stable point may show the fold ahead
             point, guess = record.point, None
+            is_stable_step = record.label == "step" and not point.negative_pivots
             if record.label == "fold":
                 guess = FoldGuess(point.state, point.du)
-            elif record.label == "step" and tries_left and not point.negative_pivots:
+            elif is_stable_step and tries_left:
                 guess = fold_ahead(scene.newton, point, "pressure")
                 tries_left -= guess is not None  # only a guess costs a try
             if guess is None:

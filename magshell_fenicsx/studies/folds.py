@@ -42,9 +42,8 @@ def has_knockdown(case: Case) -> bool:
     # transferred
     can_be_transferred = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     # with branches or a target the run may end elsewhere than at its fold
-    ends_at_fold = (
-        loading.until == "limit" and not loading.branches and loading.limit_target is None
-    )
+    may_end_elsewhere = bool(loading.branches) or loading.limit_target is not None
+    ends_at_fold = loading.until == "limit" and not may_end_elsewhere
     return can_be_transferred and ends_at_fold
 
 
@@ -77,9 +76,17 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
-    modes = scene.model.symmetry_breaking_modes  # those that a reduced model excludes
-    if fold.unstable or (modes and modes.is_unstable(fold.state)):
+    if _is_unstable(scene, fold):
         raise FoldLost("another instability comes before the fold")
+
+
+def _is_unstable(scene: Scene, fold: Fold) -> bool:
+    """Return whether the shell is unstable at a fold in another direction; collective."""
+    # modes that a reduced model excludes; the first access is collective
+    modes = scene.model.symmetry_breaking_modes
+    if fold.unstable:
+        return True
+    return modes is not None and modes.is_unstable(fold.state)
 
 
 def _constant_amplitudes(scene: Scene) -> dict[str, float]:

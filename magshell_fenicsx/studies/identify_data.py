@@ -247,16 +247,15 @@ class ResultNames:
             With the unit that is missing.
         """
         is_unknown = name not in self._dimensionless_names and name not in FOLDS
-        # the result that the name becomes with a unit behind it
-        name_with_unit = next(
-            (
-                result_name
-                for result_name, (dimensionless_name, unit) in units_by_result.items()
-                if (dimensionless_name == name and result_name.startswith(f"{name}_"))
-                or (is_unknown and result_name == f"{name}_{unit}")
-            ),
-            None,
-        )
+
+        def is_name_with_unit(result_name: str) -> bool:
+            """Return whether the name becomes that of a result with a unit behind it."""
+            dimensionless_name, unit = units_by_result[result_name]
+            if dimensionless_name == name and result_name.startswith(f"{name}_"):
+                return True
+            return is_unknown and result_name == f"{name}_{unit}"
+
+        name_with_unit = next(filter(is_name_with_unit, units_by_result), None)
         if name_with_unit and name_with_unit != name:
             _, unit = units_by_result[name_with_unit]
             raise CaseError(f"{location}: {name}: has no unit: write {name} [{unit}]")
@@ -308,8 +307,8 @@ class ResultNames:
             if unit
             else self.result_of(result, None, location)
         )
-        # zero needs no unit
-        if case_unit and not unit and float(number):
+        lacks_unit = case_unit and not unit
+        if lacks_unit and float(number):  # zero needs no unit
             raise CaseError(
                 f"{location}: {_text(amount)}: needs a unit, such as {_text(amount)} {case_unit}"
             )
@@ -435,6 +434,13 @@ def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
         ) from None
 
 
+def _in_units(point: Sequence[float], units: Mapping[str, str | None]) -> list[float | str]:
+    """Return coordinates (x, y, z) as a case has them: text where there is a unit."""
+    return [
+        f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(point, SHAPE, strict=True)
+    ]
+
+
 def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str, list[float]]]:
     """Return the case with the points of a measured shape among its named points.
 
@@ -465,23 +471,16 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
             "one or more"
         )
     # coordinates (x, y, z) of each row
-    rows: list[list[float]] = [
-        list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])
-    ]
+    coordinates = np.column_stack([columns[name] for name in SHAPE])
+    rows: list[list[float]] = [list(map(float, row)) for row in coordinates]
     for axis in SHAPE:
         _refuse_missing(axis, columns[axis], table.lines, location)
     # a point has the number of the first row with it: in reversed order this one is written last
     point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {point_names[tuple(row)]: row for row in rows}
-    # the coordinates as a case has them: text where there is a unit
-    texts = {
-        name: [
-            f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)
-        ]
-        for name, row in shape.items()
-    }
+    points_of_shape = {name: _in_units(row, units) for name, row in shape.items()}
     # the named points of the case, and these
-    data = {**source.data, "points": {**(source.data.get("points") or {}), **texts}}
+    data = {**source.data, "points": {**(source.data.get("points") or {}), **points_of_shape}}
     shape_source = Source(source.name, data, source.places, source.folder, source.files)
     return shape_source, [point_names[tuple(row)] for row in rows], shape
 
@@ -692,10 +691,10 @@ def _in_displacement_unit(
         unit_factors.append(
             column_size(axis, axis_unit, displacement_unit) if displacement_unit else 1.0
         )
-    return {
-        name: [a * b for a, b in zip(coordinates, unit_factors, strict=True)]
-        for name, coordinates in shape.items()
-    }
+    shape_in_unit = dict[str, list[float]]()
+    for name, coordinates in shape.items():
+        shape_in_unit[name] = [a * b for a, b in zip(coordinates, unit_factors, strict=True)]
+    return shape_in_unit
 
 
 def _refuse_unknown(
@@ -832,7 +831,7 @@ def _is_of_whole_path(result: str) -> bool:
 
     Such are folds, frequencies and the barrier.
     """
-    return result in FOLDS or bool(NAMES.fullmatch(result)) or result == "barrier"
+    return result in (*FOLDS, "barrier") or bool(NAMES.fullmatch(result))
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:

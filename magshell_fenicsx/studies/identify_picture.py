@@ -100,18 +100,14 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     # one shape for each state of the shell; the legend names the first one alone
     for _, rows_of_shape in groupby(sorted(rows, key=_state_of), key=_state_of):
         rows_by_point = _rows_by_point(rows_of_shape)
+        rows_of_axes = [rows_by_point.get(axis, {}) for axis in plane_axes]
         # the points that have both displacements
-        points = [
-            name
-            for name in shape
-            if all(name in rows_by_point.get(axis, {}) for axis in plane_axes)
-        ]
+        common_points = set(shape).intersection(*rows_of_axes)
+        points = [name for name in shape if name in common_points]
         # undeformed coordinates of the points along both axes
-        coordinates = [
-            [shape[name]["xyz".index(axis[1])] for name in points] for axis in plane_axes
-        ]
+        coordinates = [_coordinates(shape, points, axis) for axis in plane_axes]
         for kind, style, colour in (("predicted", "-", "C0"), ("measured", ".", "C1")):
-            u = [[rows_by_point[axis][name][kind] for name in points] for axis in plane_axes]
+            u = [_displacements(rows_of_axis, points, kind) for rows_of_axis in rows_of_axes]
             label = "" if has_labels else "fitted" if kind == "predicted" else kind
             point_style = style if _in_line(coordinates) else "."
             plot.plot(
@@ -137,6 +133,18 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     plot.set(xlabel=labels[0], ylabel=labels[1])
     plot.set_aspect("equal", adjustable="datalim")
     plot.legend(frameon=False, fontsize=8)
+
+
+def _coordinates(
+    shape: Mapping[str, Sequence[float]], points: Sequence[str], axis: str
+) -> list[float]:
+    """Return the undeformed coordinates of points along the axis of a displacement such as "ux"."""
+    return [shape[name]["xyz".index(axis[1])] for name in points]
+
+
+def _displacements(rows: Mapping[str, Row], points: Sequence[str], kind: str) -> list[float]:
+    """Return the displacements of points, of the kind "measured" or "predicted"."""
+    return [rows[name][kind] for name in points]
 
 
 def _rows_by_point(rows: Iterable[Row]) -> dict[str, dict[str, Row]]:

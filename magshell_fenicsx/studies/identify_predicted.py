@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from dataclasses import field as field_of
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -107,10 +108,7 @@ class Predictor:
         # all ranks take the parameters of rank 0
         x = np.array(self.comm.bcast(x))
         settings_and_readings = json.dumps(
-            [
-                [settings, [asdict(reading) for reading in readings]]
-                for settings, readings in self.readings.items()
-            ]
+            [[settings, _as_data(readings)] for settings, readings in self.readings.items()]
         )
         # the name of the file is a hash of the parameters and of all that a prediction depends on
         text = f"{self.mark} {settings_and_readings} {slopes}".encode()
@@ -222,6 +220,11 @@ class Predictor:
         for setting in settings:
             override(source, setting)
         return Scene(self.make_case(source).problem(), self.comm)
+
+
+def _as_data(readings: Sequence[Reading]) -> list[dict[str, Any]]:
+    """Return readings as plain data."""
+    return [asdict(reading) for reading in readings]
 
 
 def source_with_numbers(source: Source, numbers: Sequence[NumberVariable], x: Array) -> Source:

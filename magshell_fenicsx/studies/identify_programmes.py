@@ -223,6 +223,10 @@ class Programme:
             return None
         return case
 
+    def _needed_part(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the needed columns of a row."""
+        return {name: row[name] for name in self._needed_columns if name in row}
+
     def _outcome_of_run(self, case: Case) -> Outcome:
         """Run a case on this rank; any exception becomes a failed outcome.
 
@@ -238,10 +242,7 @@ class Programme:
             Exception
         ) as e:  # whatever it is, the other runs go on, and the table has no band if many fail
             outcome = Outcome.failed(" ".join(f"{FAILED}{type(e).__name__}: {e}".split()))
-        curve = [
-            {name: row[name] for name in self._needed_columns if name in row}
-            for row in outcome.curve
-        ]
+        curve = [self._needed_part(row) for row in outcome.curve]
         return replace(outcome, curve=curve, wall_s=round(time.perf_counter() - start_time, 3))
 
     @property

@@ -640,7 +640,12 @@ class _Strength:
             return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
 
         steps = LOG_STRENGTH_STEP * np.eye(len(z))
-        return np.array([[second_difference(a, b) for b in steps] for a in steps])
+
+        def row_of_matrix(a: Array) -> list[float]:
+            """Return the second derivatives along one axis, with step a, and along every axis."""
+            return [second_difference(a, b) for b in steps]
+
+        return np.array([row_of_matrix(a) for a in steps])
 
 
 def _estimated_noise(

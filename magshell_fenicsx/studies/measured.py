@@ -70,21 +70,18 @@ def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
         Keys of summary.json -> values that they must have: sources and mesh file.
     """
     content = _read(file)
-    usable = (
-        content
-        and content.machine == machine
-        and not content.failure
-        and _is_of(origin, content.summary)
-    )
-    return content if content and usable else Timings(machine)
+    if content is None or content.machine != machine:
+        return Timings(machine)
+    is_usable = not content.failure and _is_of(origin, content.summary)
+    return content if is_usable else Timings(machine)
 
 
 def of_others(file: Path, origin: Origin) -> bool:
     """Return whether a file has measurements of other sources, which cannot be used."""
     content = _read(file)
-    return (
-        content is not None and content.summary is not None and not _is_of(origin, content.summary)
-    )
+    if content is None or content.summary is None:
+        return False
+    return not _is_of(origin, content.summary)
 
 
 def _read(file: Path) -> Timings | None:

@@ -208,10 +208,8 @@ def make_points(source: Source, axes: Sequence[Axis], make_case: MakeCase) -> li
     count = prod(len(axis.values) for axis in axes)
     if count > MOST_POINTS:
         raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
-    return [
-        make_point(source, axes, values, make_case)
-        for values in product(*(axis.values for axis in axes))
-    ]
+    values_of_axes = [axis.values for axis in axes]
+    return [make_point(source, axes, values, make_case) for values in product(*values_of_axes)]
 
 
 def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> Source:
@@ -259,20 +257,22 @@ def make_point(
     return SweepPoint(values_by_key, case, identity(case))
 
 
+def _has_magnetic_effect(case: Case) -> bool:
+    """Return whether the magnetic section of a case has an effect on any result."""
+    if case.lambda_m:  # the size of the magnetic load
+        return True
+    if case.sensors or case.field_maps:
+        return True
+    return case.magnetic is not None and case.magnetic.interaction != "none"
+
+
 def identity(case: Case) -> str:
     """Return a hash of the problem: of the case with its defaults, and of its mesh file.
 
     A magnetic section that has no effect does not count, as one with a field of zero.
     """
     data = case.model_dump(mode="json") | case.outside
-    magnetic = case.magnetic
-    has_magnetic_effect = (
-        case.lambda_m  # the size of the magnetic load
-        or case.sensors
-        or case.field_maps
-        or (magnetic and magnetic.interaction != "none")
-    )
-    if not has_magnetic_effect:
+    if not _has_magnetic_effect(case):
         del data["magnetic"]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 

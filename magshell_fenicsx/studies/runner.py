@@ -154,6 +154,13 @@ def stored_outcome(
         return None
 
 
+def _are_of_part(first: str, number: str, count: int) -> bool:
+    """Return whether two texts are numbers i and n of a part, with 1 <= i <= n <= count."""
+    if not (first.isdecimal() and number.isdecimal()):
+        return False
+    return 1 <= int(first) <= int(number) <= count
+
+
 def part_of(part: str | None, count: int, items: str) -> tuple[int, int]:
     """Return the numbers i and n of a part "i/n", one of n jobs; None is the only part of one job.
 
@@ -174,13 +181,8 @@ def part_of(part: str | None, count: int, items: str) -> tuple[int, int]:
     >>> part_of("2/3", 5, "points"), part_of(None, 5, "points")
     ((2, 3), (1, 1))
     """
-    first, slash, number = (part or "1/1").partition("/")
-    if not (
-        slash
-        and first.isdecimal()
-        and number.isdecimal()
-        and 1 <= int(first) <= int(number) <= count
-    ):
+    first, _, number = (part or "1/1").partition("/")
+    if not _are_of_part(first, number, count):
         raise CaseError(
             f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {items}"
         )
@@ -446,7 +448,7 @@ class Outcome:
             "snaps": self.snaps,
         }
         # rows as texts, as in path.csv
-        rows = [{key: str(v) for key, v in row.items()} for row in self.curve]
+        rows = [_texts_of(row) for row in self.curve]
         return scalar.value_in(summary, rows)
 
     def serves(self, scalar: Scalar) -> bool:
@@ -454,12 +456,29 @@ class Outcome:
 
         A fold alone has the knockdown only. A path must have the columns of the number.
         """
+        if scalar.name == "knockdown":
+            return True
+        if self.found != "path":
+            return False
         needed = {scalar.column, scalar.at} & set(COLUMNS)  # those that an outcome may leave out
-        has_path = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
-        return has_path or scalar.name == "knockdown"
+        return not self.curve or needed <= self.curve[0].keys()
 
 
 OUTCOME = TypeAdapter(Outcome)
+
+
+def _texts_of(row: Mapping[str, Any]) -> dict[str, str]:
+    """Return the values of a row as texts."""
+    return {key: str(v) for key, v in row.items()}
+
+
+def _kept_part(row: Row, kept_columns: Iterable[str]) -> Row:
+    """Return those of some columns that a row has, without numbers of numpy."""
+    return {
+        key: v if isinstance(v := row[key], str | int) else float(v)
+        for key in kept_columns
+        if key in row
+    }
 
 
 def outcome_of(
@@ -491,14 +510,7 @@ def outcome_of(
         stopped=result.stopped,
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
-        curve=[
-            {
-                key: v if isinstance(v := row[key], str | int) else float(v)
-                for key in kept_columns
-                if key in row
-            }
-            for row in result.rows
-        ],
+        curve=[_kept_part(row, kept_columns) for row in result.rows],
         found=origin,
         factorisations=factorisations,
         barrier=result.barrier,
@@ -515,7 +527,9 @@ def _event(result: Result) -> dict[str, Any] | None:
     last_row, steps = result.rows[-1], result.scene.problem.programme
     # what ends the last step; only a motion in time has the amplitude "time"
     until = getattr(steps[-1].load, "until", "") if steps else ""
-    if result.stopped or last_row["amplitude"] != "time" or until not in ("event", "instability"):
+    if result.stopped or last_row["amplitude"] != "time":
+        return None
+    if until not in ("event", "instability"):
         return None
     common = {key: last_row[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
     return {**common, "kind": until, "mode": "", "value": last_row["time"]}

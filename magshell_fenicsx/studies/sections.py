@@ -95,7 +95,9 @@ class ObjectiveSection(Section):
         """Names of all results of the objective; several for `maximise` alone."""
         if isinstance(self.maximise, list):
             return self.maximise
-        return [self.maximise or self.minimise or self.reach or "shape"]
+        extreme_result = self.maximise or self.minimise
+        reached_result = self.reach or "shape"
+        return [extreme_result or reached_result]
 
 
 class LimitSection(Section):
@@ -113,7 +115,7 @@ class LimitSection(Section):
     @model_validator(mode="after")
     def _bounds(self) -> Self:
         """Check that a limit has a bound."""
-        if self.least is None and self.most is None and self.same_as is None:
+        if all(bound is None for bound in (self.least, self.most, self.same_as)):
             raise ValueError(f"of: {self.of}: give least, most, both, or same_as")
         return self
 
@@ -202,7 +204,8 @@ class DesignSection(Section):
     @model_validator(mode="after")
     def _something_varies(self) -> Self:
         """Check that something varies, and that all bounds are ordered and in one unit."""
-        if not self.numbers and self.remanence is None and not self.fields:
+        has_numbers_or_remanence = bool(self.numbers) or self.remanence is not None
+        if not has_numbers_or_remanence and not self.fields:
             raise ValueError(
                 "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing "
                 "varies"
@@ -329,8 +332,8 @@ class EnsembleSection(Section):
         )
         on_all_shells = None in self._shells_with_defects
         for key in self.keys:
-            is_of_any_shell = f".{IMPERFECTIONS}" in key
-            if key.startswith(reserved_keys) or (on_all_shells and is_of_any_shell):
+            is_of_shell_with_defects = on_all_shells and f".{IMPERFECTIONS}" in key
+            if key.startswith(reserved_keys) or is_of_shell_with_defects:
                 raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
         return self
 

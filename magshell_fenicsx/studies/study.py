@@ -200,7 +200,7 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
     """
     if MPI.COMM_WORLD.size > 1:
         raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
-    if repeat < 1 or not ranks or min(ranks) < 1:
+    if repeat < 1 or min(ranks, default=0) < 1:
         raise CaseError("--repeat and --ranks must be at least 1")
     if max(ranks) > 1 and not mpirun_path():
         raise CaseError("--ranks: there is no mpirun to start more than one")

@@ -216,12 +216,17 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
     """
     # keys in which the runs must agree with the finest one
     fixed_keys = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
+
+    def is_comparable(row: Row) -> bool:
+        """Return whether a row has a result on the finest or a coarser mesh, and else agrees."""
+        if row["result"] is None or not row["dofs"] <= finest["dofs"]:
+            return False
+        return all(row[key] == finest[key] for key in fixed_keys)
+
     results_by_refinement = {
         run.point.case.mesh.refinement: row["result"]
         for run, row in zip(runs, rows, strict=True)
-        if row["result"] is not None
-        and row["dofs"] <= finest["dofs"]
-        and all(row[k] == finest[k] for k in fixed_keys)
+        if is_comparable(row)
     }
     refinements = sorted(results_by_refinement)
     error, order = estimated_error(
@@ -255,8 +260,9 @@ def _beats(a: Row, b: Row, cost_column: str) -> bool:
     """Return whether row a is at least as good as b in time and in error, and better in one."""
     time_of_a, error_of_a = a[cost_column], a["error"]
     time_of_b, error_of_b = b[cost_column], b["error"]
-    differ = (time_of_a, error_of_a) != (time_of_b, error_of_b)
-    return differ and time_of_a <= time_of_b and error_of_a <= error_of_b
+    if (time_of_a, error_of_a) == (time_of_b, error_of_b):
+        return False
+    return bool(time_of_a <= time_of_b and error_of_a <= error_of_b)
 
 
 FORMS = {
@@ -428,13 +434,18 @@ def draw_study(
     plt.close(figure)
 
 
+def _varies(name: str, rows: Sequence[Row]) -> bool:
+    """Return whether a column has several values in some rows."""
+    return len({row[name] for row in rows}) > 1
+
+
 def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     """Return series of rows that differ in the mesh refinement alone, each by growing unknowns.
 
     The key of a series is a label of the values that other series do not share.
     """
     names = [*(key for key in keys if key != REFINEMENT), "ranks"]
-    varying_names = [name for name in names if len({row[name] for row in rows}) > 1]
+    varying_names = [name for name in names if _varies(name, rows)]
     series: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
         label = ", ".join(f"{short_key(name)} {row[name]}" for name in varying_names) or "runs"
@@ -458,7 +469,7 @@ def _draw_errors(
 
     # a line for each series
     for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
-        x, error = ([row[key] for row in rows] for key in (quantity, "error"))
+        x, error = [row[quantity] for row in rows], [row["error"] for row in rows]
         axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
     # the Pareto front as steps, with circles around its runs
     pareto_points = sorted(

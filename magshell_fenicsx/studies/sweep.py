@@ -152,7 +152,8 @@ def sweep(  # noqa: PLR0913 - what a user gives
     """
     axes, scalar = parse_axes(over), parse_scalar(result) if result else None
     # other numbers than a knockdown need the path
-    full_paths = full_paths or not (scalar is None or scalar.name == "knockdown")
+    is_another_number = scalar is not None and scalar.name != "knockdown"
+    full_paths = full_paths or is_another_number
     source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
     requested = on_first_rank(comm, lambda: make_points(source, axes, make_case))
     share = share_of(part, len(requested))
@@ -268,7 +269,9 @@ def share_of(part: str | None, count: int) -> range:
 def _is_known(file: Path, scalar: Scalar | None) -> bool:
     """Return whether a file has the outcome of these sources, with the requested number if any."""
     outcome = stored_outcome_of_case(file)
-    return outcome is not None and (scalar is None or outcome.serves(scalar))
+    if outcome is None:
+        return False
+    return scalar is None or outcome.serves(scalar)
 
 
 def _words(outcome: Outcome, scalar: Scalar | None) -> str:
@@ -364,10 +367,14 @@ def _chains_of(
     # a fold is followed between cases that end at one; the state of a solid cannot be transferred
     # to another mesh
     one_mesh = key.startswith("magnetic.")
-    can_be_followed = all(
-        has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in links
-    )
-    if len(links) < 2 or not can_be_followed:
+
+    def can_be_followed(link: Link) -> bool:
+        """Return whether the fold of a case can be followed along the line."""
+        if not has_knockdown(link.case):
+            return False
+        return one_mesh or link.case.model == "shell"
+
+    if len(links) < 2 or not all(can_be_followed(link) for link in links):
         return [[link] for link in links]
     lowest_symmetry = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
     chain = [
@@ -520,16 +527,18 @@ def _continuation_from(parameter: float, result: Result) -> Continuation | None:
         Value of the chain's axis for this run.
     """
     last_row = result.rows[result.end]
-    if (
-        last_row["label"] != "fold"
-        or last_row["amplitude"] != "pressure"
-        or last_row["p_over_pc"] != result.knockdown
-    ):
+    is_pressure_fold = last_row["label"] == "fold" and last_row["amplitude"] == "pressure"
+    if not is_pressure_fold or last_row["p_over_pc"] != result.knockdown:
         return None
     try:
         return Continuation(parameter, result.scene, result.last)
     except FoldLost:
         return None
+
+
+def _values_on(axes: Sequence[Axis], point: SweepPoint) -> list[str]:
+    """Return the value of a point on each axis; tied keys have the same."""
+    return [point.values[axis.keys[0]] for axis in axes]
 
 
 def with_earlier(
@@ -558,12 +567,12 @@ def with_earlier(
     keys = [list(axis.keys) for axis in axes]
     base = _base(source, axes)  # a hash of the case without the swept keys
     earlier = _earlier(folder, keys, base)
-    new_values = [[point.values[axis.keys[0]] for axis in axes] for point in points]
+    new_values = [_values_on(axes, point) for point in points]
     # axes with the values of all points: their units make equal numbers of different units equal
-    all_axes = [
-        Axis(axis.keys, tuple(values[i] for values in (*new_values, *earlier)))
-        for i, axis in enumerate(axes)
-    ]
+    all_axes = list[Axis]()
+    for i, axis in enumerate(axes):
+        values_on_axis = tuple(values[i] for values in (*new_values, *earlier))
+        all_axes.append(Axis(axis.keys, values_on_axis))
     # a place is a text for each axis, the same for equal numbers
     new_places = {_place(values, all_axes) for values in new_values}
     earlier_only = [values for values in earlier if _place(values, all_axes) not in new_places]
@@ -648,6 +657,11 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
     return stored_sweep.points
 
 
+def _is_index(word: str, count: int) -> bool:
+    """Return whether a word of a key is the number of one of `count` items, from 0."""
+    return word.isdecimal() and int(word) < count
+
+
 def _base(source: Source, axes: Sequence[Axis]) -> str:
     """Return a hash of the case as written, without the swept keys."""
     data = copy.deepcopy(source.data)
@@ -656,7 +670,7 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
         section = value_at(data, sections)
         if isinstance(section, dict):
             section.pop(last_word, None)
-        elif isinstance(section, list) and last_word.isdecimal() and int(last_word) < len(section):
+        elif isinstance(section, list) and _is_index(last_word, len(section)):
             section[int(last_word)] = None  # keeps the numbers of the other items
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
@@ -747,9 +761,10 @@ def _write_curves(outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]], file
         {**point.values, **row} for point, outcome in outcomes_of_points for row in outcome.curve
     ]
     first_point, _ = outcomes_of_points[0]
-    columns_of_curves = [key for key in CURVE if any(key in line for line in lines)]
+    keys_of_lines = dict.fromkeys(key for line in lines for key in line)
+    columns_of_curves = [key for key in CURVE if key in keys_of_lines]
     # swept keys, and columns that scenes add
-    further_columns = [key for line in lines for key in line if key not in COLUMNS]
+    further_columns = [key for key in keys_of_lines if key not in COLUMNS]
     all_columns = dict.fromkeys((*first_point.values, *columns_of_curves, *further_columns))
     write_csv(lines, tuple(all_columns), file)
 

@@ -55,6 +55,11 @@ class Results:
     measured: str = ""
 
 
+def _distinct_values(axis: Axis, points: Sequence[SweepPoint]) -> tuple[str, ...]:
+    """Return the values of points on an axis, each once, in the order of the points."""
+    return tuple(dict.fromkeys(point.values[axis.keys[0]] for point in points))
+
+
 def draw_sweep(
     axes: Sequence[Axis],
     points: Sequence[SweepPoint],
@@ -79,10 +84,7 @@ def draw_sweep(
     import matplotlib.pyplot as plt
 
     # values of all points, also of earlier sweeps
-    axes = [
-        Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points)))
-        for axis in axes
-    ]
+    axes = [Axis(axis.keys, _distinct_values(axis, points)) for axis in axes]
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
     results, is_map = _results(outcomes, requested), _is_map(axes)
     if is_map:
@@ -283,8 +285,8 @@ def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outco
     x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         rows = loaded(outcome.curve, amplitude)
-        places = ([quantity.on_axis(row) for row in rows] for quantity in (x, y))
-        plot.plot(*places, style, marker=".", label=_label(point, without=None))
+        x_values, y_values = [x.on_axis(row) for row in rows], [y.on_axis(row) for row in rows]
+        plot.plot(x_values, y_values, style, marker=".", label=_label(point, without=None))
     plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     plot.set(xlabel=x.label, ylabel=y.label)
 

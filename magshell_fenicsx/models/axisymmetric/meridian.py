@@ -239,17 +239,16 @@ def make_meridian(
     poles = [facet for name, facet in zip(names, facets, strict=True) if not name]
     axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
-    if points is None or (shell_intervals and "pole" not in points):
-        supported = [
-            float(end)
-            for name, end in zip(names, np.ravel(intervals), strict=True)
-            if name in supported_ends
-        ]
+    known_points = points or {}
+    needs_pole = points is None or bool(shell_intervals)
+    if needs_pole and "pole" not in known_points:
+        named_ends = zip(names, np.ravel(intervals), strict=True)
+        supported = [float(end) for name, end in named_ends if name in supported_ends]
         s = _highest_parameter(embedding, vertices, supported) if shell_intervals else 0.0
-        points = {**(points or {}), "pole": (s, 0.0)}
+        known_points = {**known_points, "pole": (s, 0.0)}
     middles = domain.geometry.x[compat.geometry_dofs(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in shell_intervals}
-    return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
+    return Meridian(domain, axis, ends, embedding, known_points, curvature, patches, tied)
 
 
 def _is_in_interval(vertices: Array, intervals: Sequence[tuple[float, float]]) -> NDArray[np.bool_]:

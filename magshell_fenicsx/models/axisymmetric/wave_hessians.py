@@ -197,10 +197,14 @@ class _WaveBatch:
         self._given = [
             parameters_at(points, e.density.parameters, sides) for e in energies if e.density
         ]
-        self._varying = [
-            [(target, on_batches(field, [batch], sides)) for target, field in varying]
-            for _, varying in self._given
-        ]
+
+        def on_batch(
+            varying: Sequence[tuple[fem.Function, fem.Function]],
+        ) -> list[tuple[fem.Function, Memo[list[Array]]]]:
+            """Return point fields, each with the field of its values at the points."""
+            return [(target, on_batches(field, [batch], sides)) for target, field in varying]
+
+        self._varying = [on_batch(varying) for _, varying in self._given]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
         """Return the nodes of the rows and of the columns of each entity's matrix.
@@ -270,10 +274,7 @@ class _WaveBatch:
         """
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
         jets_of_waves = [wave_jets_of(side_jets, self._m) for side_jets in waves]
-        u, r0, initial_jets = (
-            [revolved_jet_of(self._of_sides(field, PLANE, side)) for side in self._sides]
-            for field in (self._at_u, self._at_r0, self._at_initial)
-        )
+        u, r0, initial_jets = map(self._revolved_jets, (self._at_u, self._at_r0, self._at_initial))
         kernels = []
         for energy, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert energy.density
@@ -314,6 +315,10 @@ class _WaveBatch:
         ]
         return covectors, sum(widths, ufl.zero()) / len(widths)
 
+    def _revolved_jets(self, field: fem.Function) -> list[Jet]:
+        """Return the jets of an axisymmetric point field on each side of an entity."""
+        return [revolved_jet_of(self._of_sides(field, PLANE, side)) for side in self._sides]
+
     def _of_sides(self, field: fem.Function, components: int, side: int) -> list[list[Expr]]:
         """Return value and two derivatives of a field's components on one side of an entity.
 
@@ -321,10 +326,8 @@ class _WaveBatch:
         and their second derivatives.
         """
         first = components * DERIVATIVES * side
-        return [
-            [field[first + components * d + c] for c in range(components)]
-            for d in range(DERIVATIVES)
-        ]
+        entries = [field[first + i] for i in range(components * DERIVATIVES)]
+        return [entries[i : i + components] for i in range(0, len(entries), components)]
 
     def _derivatives(self, field: fem.Function) -> Array:
         """Return an axisymmetric field at the points: its value, first and second derivative.

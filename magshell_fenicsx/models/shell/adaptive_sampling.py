@@ -16,6 +16,7 @@ the logarithm of one over the width.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import basix
 import numpy as np
@@ -76,12 +77,11 @@ class SubCells:
 
     @classmethod
     def concatenate(cls, groups: "Sequence[SubCells]") -> "SubCells":
-        return cls(
-            *(
-                np.concatenate([getattr(group, name) for group in groups])
-                for name in ("cell", "corner", "sides")
-            )
-        )
+        def joined(name: str) -> NDArray[Any]:
+            """Return one array of all groups."""
+            return np.concatenate([getattr(group, name) for group in groups])
+
+        return cls(*map(joined, ("cell", "corner", "sides")))
 
     def batches(self) -> "list[SubCells]":
         """Return these parts in groups of at most `BATCH_SIZE`."""
@@ -311,12 +311,11 @@ class _Samples:
 
     @classmethod
     def concatenate(cls, groups: "Sequence[_Samples]") -> "_Samples":
-        return cls(
-            *(
-                np.concatenate([getattr(samples, name) for samples in groups])
-                for name in cls.__dataclass_fields__
-            )
-        )
+        def joined(name: str) -> NDArray[Any]:
+            """Return one array of all groups."""
+            return np.concatenate([getattr(samples, name) for samples in groups])
+
+        return cls(*map(joined, cls.__dataclass_fields__))
 
 
 def _sample(

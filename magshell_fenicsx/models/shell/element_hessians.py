@@ -130,9 +130,8 @@ class HessianIntegral:
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
         pairs = BlockPairs(tuple(sorted(pairs.within_side, key=_neighbours)), pairs.cross)
         self._coupled = pairs
-        self._contractions = {
-            rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}
-        }
+        rules = {batch.rule for batch in batches}
+        self._contractions = {rule: Contraction(rule, pairs) for rule in rules}
 
     def add(
         self,
@@ -295,7 +294,7 @@ class Kernel:
         # z is what the density is differentiated by: v, or the jets of u
         z = self._points.field(3 * JET_SIZE) if of_v else u
         arguments = (r0, u, z) if of_v else (r0, u)
-        jets = [[_jet(field, side) for side in range(sides)] for field in arguments]
+        jets = [_jets(field, sides) for field in arguments]
         # on edges: the covector on each side, and the width
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
         edge = (m, geometry[2 * sides]) if density.on_edges else None
@@ -359,13 +358,18 @@ def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:
     return max(DERIVATIVE_RANK[pair[0]], DERIVATIVE_RANK[pair[1]]), pair
 
 
+def _jets(field: fem.Function, sides: int) -> list[Jet]:
+    """Return the jets on all sides from a point field."""
+    return [_jet(field, side) for side in range(sides)]
+
+
 def _jet(field: fem.Function, side: int) -> Jet:
     """Return the jet on one side (0 or 1) as UFL vectors, from a point field of jets on all sides.
 
     The field holds the six parts of the first side, three components each, then the second side's.
     """
-    parts = range(side * JET_SIZE, (side + 1) * JET_SIZE)
-    return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
+    first_entries = range(3 * side * JET_SIZE, 3 * (side + 1) * JET_SIZE, 3)
+    return Jet(*(ufl.as_vector([field[i], field[i + 1], field[i + 2]]) for i in first_entries))
 
 
 def parameters_at(

@@ -125,9 +125,8 @@ class Density:
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
     """Return the vectors of both sides from a point field that holds one after the other."""
     size = field.ufl_shape[0] // 2
-    first, second = (
-        ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2)
-    )
+    first = ufl.as_vector([field[c] for c in range(size)])
+    second = ufl.as_vector([field[size + c] for c in range(size)])
     return first, second
 
 

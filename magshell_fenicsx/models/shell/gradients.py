@@ -266,12 +266,14 @@ def _energy(
     placement, *displacements = fields
     # frames and jets on each side
     sides = range(density.sides)
-    frames = [[point_geometry[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
+    frames = [_frame(point_geometry, side) for side in sides]
     r0_jets = [_jet(placement, side, parts) for side in sides]
-    displacement_jets = [
-        [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
-        for f in displacements
-    ]
+
+    def own_jets(displacement: fem.Function) -> list[Jet]:
+        """Return the jets of a displacement on each side, in the cells' own coordinates."""
+        return [in_own_coordinates(_jet(displacement, side, parts), frames[side]) for side in sides]
+
+    displacement_jets = [own_jets(displacement) for displacement in displacements]
     # the determinant in the frame turns an area of the flat cell into one of the reference cell
     if not density.on_edges:
         *_, determinant = frames[0]
@@ -285,14 +287,19 @@ def _energy(
     return density.value_at([r0_jets, *displacement_jets], (m, width), parameters)
 
 
+def _frame(point_geometry: fem.Function, side: int) -> list[Expr]:
+    """Return the frame on one side, from the point field of frames."""
+    return [point_geometry[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)]
+
+
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
     """Return the jet on one side, from a point field of jet parts.
 
     Parts that are not known at the points are zero, since no density needs them.
     """
-    first = 3 * len(parts) * side
+    first_entries = range(3 * len(parts) * side, 3 * len(parts) * (side + 1), 3)
     vectors = {
-        part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)])
-        for number, part in enumerate(parts)
+        part: ufl.as_vector([field[i], field[i + 1], field[i + 2]])
+        for part, i in zip(parts, first_entries, strict=True)
     }
     return Jet(*(vectors.get(name, ufl.zero(3)) for name in JET_NAMES))

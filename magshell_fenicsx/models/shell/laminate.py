@@ -127,11 +127,11 @@ class Laminated(Law):
         `nu` is the Poisson's ratio with which the stiffness of the units is defined, no property of
         the plies.
         """
-        A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
+        A, B, D = (tuple(map(float, S)) for S in laminate.matrices)
         direction, meridian = laminate.direction, laminate.direction is None
         # meridians are those about the shell's e3
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
-        axis, origin = (tuple(float(c) for c in v) for v in (axis_in_model, laminate.origin))
+        axis, origin = tuple(map(float, axis_in_model)), tuple(map(float, laminate.origin))
         return cls(h, nu, A=A, B=B, D=D, axis=axis, origin=origin, meridian=meridian)
 
     @property

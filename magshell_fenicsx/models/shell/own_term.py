@@ -197,7 +197,7 @@ class OwnTerm:
             raise ValueError(f"{self.name}: on: {self.on!r}: must be the name of one edge")
         if not self.densities:
             raise ValueError(f"{self.name}: has neither a density nor anything that it observes")
-        if self.density is None and (self.free_parameters or self.value):
+        if self._lacks_density():
             raise ValueError(
                 f"{self.name}: only observes: a value or a Free parameter needs a density"
             )
@@ -307,8 +307,10 @@ class OwnTerm:
         into the frame in which the density was written, and then evaluate it. Cosine and sine of
         the angle are appended to the parameters, so that another angle needs no new kernel.
         """
+        if not angle:
+            return self
         # an axisymmetric density is the same in both frames
-        if not angle or (self.turns and not self.formula_parameters):
+        if self.turns and not self.formula_parameters:
             return self
 
         def rotated(v: Expr, about: Expr) -> Expr:
@@ -317,13 +319,16 @@ class OwnTerm:
             (c, s), (x, y, z) = (about[0], about[1]), (v[0], v[1], v[2])
             return ufl.as_vector([c * x - s * y, s * x + c * y, z])
 
+        def rotated_jet(jet: Jet, about: Expr) -> Jet:
+            """Return a jet with each part rotated about e3."""
+            return Jet(*(rotated(part, about) for part in jet.parts()))
+
         def in_frame(density: Callable[..., Expr]) -> Callable[..., Expr]:
             """Return a density of jets in the turned frame; its last parameter is the rotation."""
 
             def density_in_frame(r0: Jet, u: Jet, *arguments: Any) -> Expr:
                 """Evaluate the density at rotated jets, with rotated vectors of an edge."""
                 *arguments_left, rotation = arguments  # the appended parameter comes last
-                jets = (Jet(*(rotated(part, rotation) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
                     edge, *parameters_left = arguments_left
                     rotated_edge = replace(
@@ -332,6 +337,7 @@ class OwnTerm:
                         along=rotated(edge.along, rotation),
                     )
                     arguments_left = [rotated_edge, *parameters_left]
+                jets = rotated_jet(r0, rotation), rotated_jet(u, rotation)
                 return density(*jets, *arguments_left)
 
             return density_in_frame
@@ -485,10 +491,12 @@ class OwnTerm:
 
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
-        r0, u = (
-            Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(ALL_DERIVATIVES))))
-            for _ in range(2)
-        )
+
+        def jet() -> Jet:
+            """Return a jet of new variables."""
+            return Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(ALL_DERIVATIVES))))
+
+        r0, u = jet(), jet()
         m = ufl.Coefficient(
             ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,)))
         )
@@ -504,6 +512,12 @@ class OwnTerm:
                 "... by functions of "
                 "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
             ) from e
+
+    def _lacks_density(self) -> bool:
+        """Return whether the term only observes, but has a value or a parameter to vary."""
+        if self.density is not None:
+            return False
+        return bool(self.free_parameters or self.value)
 
     def _foreign_terminals(self) -> list[Expr]:
         """Return fields, constants and coordinates in the density that are not its arguments.

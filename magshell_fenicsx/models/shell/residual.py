@@ -585,7 +585,12 @@ def slopes(
     A derivative is named after its term, followed by `words`. `serve` is a function from terms to a
     `FastResidual` that can add each of them alone.
     """
-    terms_with_p = [term for term in terms if any(q is p for q in term.density.parameters)]
+
+    def depends_on_p(term: PointTerm) -> bool:
+        """Return whether p is a parameter of a term's density."""
+        return any(q is p for q in term.density.parameters)
+
+    terms_with_p = [term for term in terms if depends_on_p(term)]
     derivatives = [
         ParameterDerivative(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
         for term in terms_with_p

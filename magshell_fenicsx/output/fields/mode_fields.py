@@ -81,7 +81,8 @@ def mode_surface(
     On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and
     "mode_w" (n,), the component of the mode along -n0; None on other ranks.
     """
-    if (label.startswith(WAVES) or label == TORSION) and model.axisymmetric:
+    is_wave = label.startswith(WAVES) or label == TORSION
+    if is_wave and model.axisymmetric:
         if gatherer.comm.rank:
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))

@@ -426,10 +426,11 @@ class PointFields:
         # loads on the remanence, which are derived for a uniform field
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
-        if field and field.uniform and not has_no_remanence:
+        field_at_remanence = None if has_no_remanence else field
+        if field_at_remanence and field_at_remanence.uniform:
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(
-                self._geometry(), field, inside_cells(r0[0]), h
+                self._geometry(), field_at_remanence, inside_cells(r0[0]), h
             )
 
     @property

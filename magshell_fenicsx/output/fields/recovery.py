@@ -285,7 +285,10 @@ def _powers(dimensions: int, degree: int) -> list[tuple[int, ...]]:
 def _monomials(y: Array, degree: int) -> Array:
     """Return the values (..., coefficients) of all monomials up to `degree` at y (..., d)."""
     # of each variable its powers (..., degree + 1)
-    powers = [np.stack([x**n for n in range(degree + 1)], axis=-1) for x in np.moveaxis(y, -1, 0)]
+    powers = list[Array]()
+    for x in np.moveaxis(y, -1, 0):
+        powers_of_variable = [x**n for n in range(degree + 1)]
+        powers.append(np.stack(powers_of_variable, axis=-1))
     monomials = []
     for exponents in _powers(len(powers), degree):
         factors = [power[..., n] for power, n in zip(powers, exponents, strict=True)]

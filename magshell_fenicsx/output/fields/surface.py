@@ -591,16 +591,17 @@ def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
         """Return the values that a function takes from a surface, of one copy after the other."""
         return np.concatenate([values_of(copy) for copy in copies])
 
+    def field_of_all_copies(name: str) -> Array:
+        """Return the values of a field of one copy after the other."""
+        return of_all_copies(lambda s: s.fields[name])
+
     return replace(
         surface_and_image,
         r0=of_all_copies(lambda s: s.r0),
         u=of_all_copies(lambda s: s.u),
         n0=of_all_copies(lambda s: s.n0),
         cells=np.concatenate([surface_and_image.cells + k * count for k in range(len(copies))]),
-        fields={
-            name: np.concatenate([copy.fields[name] for copy in copies])
-            for name in surface_and_image.fields
-        },
+        fields={name: field_of_all_copies(name) for name in surface_and_image.fields},
     )
 
 

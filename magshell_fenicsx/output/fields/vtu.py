@@ -259,13 +259,15 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     return surface, shell_data
 
 
+def _have_nodes(cells: NDArray[Any], count: int) -> bool:
+    """Return whether there are cells, and all their node numbers are below the number of nodes."""
+    return cells.size > 0 and bool(0 <= cells.min() <= cells.max() < count)
+
+
 def _refuse_unfit_nodes(r0: Array, u_over_h: Array, n0: Array, cells: NDArray[Any]) -> None:
     """Raise ValueError if nodes are not (n, 3) and finite, or if cells have other node numbers."""
-    if (
-        {r0.shape, u_over_h.shape, n0.shape} != {(len(r0), 3)}
-        or not cells.size
-        or not 0 <= cells.min() <= cells.max() < len(r0)
-    ):
+    have_one_shape = {r0.shape, u_over_h.shape, n0.shape} == {(len(r0), 3)}
+    if not have_one_shape or not _have_nodes(cells, len(r0)):
         raise ValueError("its cells have no nodes")
     if not all(np.isfinite(values).all() for values in (r0, u_over_h, n0)):
         raise ValueError("a node is nowhere")

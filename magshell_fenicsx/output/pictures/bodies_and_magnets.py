@@ -259,7 +259,12 @@ def bare_outlines(surface: Surface) -> tuple[Array, ...]:
 def far_bodies_note(surface: Surface) -> str:
     """Return a note on bodies and sources that are too far away to be drawn; empty without such."""
     near = near_solids(surface)
-    far_solids = [solid for solid in surface.solids if not any(solid is other for other in near)]
+
+    def is_near(solid: Solid) -> bool:
+        """Return whether a body is one of those near the surface."""
+        return any(solid is other for other in near)
+
+    far_solids = [solid for solid in surface.solids if not is_near(solid)]
     middle = (surface.r0 + surface.u).mean(axis=0)
     words = [f"{solid.name} ({_distance(solid, middle):.2g} R away)" for solid in far_solids]
     if words:

@@ -351,7 +351,8 @@ def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
                 np.ptp(axes.transData.transform(part_of_curve.T), axis=0) * 72 / axes.figure.dpi
             )
             ends_at_mark = line.rows[last_row]["label"] in LOCATED
-            if unstable and ends_at_mark and max(size_in_points) < HIDDEN_SIZE:
+            is_hidden = ends_at_mark and max(size_in_points) < HIDDEN_SIZE
+            if unstable and is_hidden:
                 low, high = part_of_curve.min(axis=1), part_of_curve.max(axis=1)
                 margin = INSET_MARGIN * (high - low)
                 return np.array([low - margin, high + margin])

@@ -67,7 +67,7 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
 
     # all curves must have the quantities of the first one on their axes
     steps = {folder: _last_step(folder, rows) for folder, rows in runs.items()}
-    axes_names = {folder: tuple(q.name for q in axes_for(step)) for folder, step in steps.items()}
+    axes_names = {folder: _axes_names(step) for folder, step in steps.items()}
     first_folder = next(iter(steps))
     first_step = steps[first_folder]
     for folder, names in axes_names.items():
@@ -116,6 +116,11 @@ def _last_step(folder: Path, rows: Sequence[Row]) -> CurveStep:
     return curve_steps(path, str(path[-1]["amplitude"]))[-1]
 
 
+def _axes_names(step: CurveStep) -> tuple[str, ...]:
+    """Return the names of the quantities on the axes of a step's curve."""
+    return tuple(q.name for q in axes_for(step))
+
+
 def labels(cases: Mapping[Path, Mapping[str, Any]]) -> list[str]:
     """Return a label for each run: the values of the keys in which the cases differ.
 
@@ -129,9 +134,12 @@ def labels(cases: Mapping[Path, Mapping[str, Any]]) -> list[str]:
     """
     flat_cases = [dict(_flat(case)) for case in cases.values()]
     all_keys = dict.fromkeys(key for case in flat_cases for key in case)
-    differing_keys = [
-        key for key in all_keys if len({str(case.get(key)) for case in flat_cases}) > 1
-    ]
+
+    def differs(key: str) -> bool:
+        """Return whether a key has several values in the cases."""
+        return len({str(case.get(key)) for case in flat_cases}) > 1
+
+    differing_keys = [key for key in all_keys if differs(key)]
     if not 0 < len(differing_keys) <= MAX_KEYS:
         return [folder.name.replace("$", r"\$") for folder in cases]
     names = []
@@ -170,6 +178,11 @@ def _value_words(value: Any) -> str:
     return str(value).replace("$", r"\$")
 
 
+def _last_curve_with(row: Row, steps: Sequence[CurveStep]) -> int | None:
+    """Return the number of the last curve that has a row; None if no curve has it."""
+    return next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
+
+
 def add_shapes(
     figure: "Figure",
     steps: Sequence[CurveStep],
@@ -193,11 +206,7 @@ def add_shapes(
     camera
         Projection of all shells.
     """
-    # for each shape the number of the last curve that has its row; None if no curve has it
-    curve_numbers = [
-        next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
-        for row, _ in shapes
-    ]
+    curve_numbers = [_last_curve_with(row, steps) for row, _ in shapes]
     # one factor for the displacements of all shapes; it is in the titles
     factor = magnification([surface for _, surface in shapes])
     magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]

@@ -198,6 +198,11 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     return figure
 
 
+def _named_arrow_count(panel: Panel) -> int:
+    """Return how many arrows of a panel have a name, each a line of its legend."""
+    return sum(bool(arrows.name) for arrows in panel.arrows)
+
+
 @dataclass(frozen=True)
 class _CellSizes:
     """Sizes of the cells of a figure, in inches; each cell has one panel.
@@ -231,9 +236,7 @@ class _CellSizes:
         image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
         has_bar = any(panel.scale.colours for panel in panels)
         height_below = (4.2 if has_bar else 0.4) * line_height
-        legend_lines = max(
-            (sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0
-        )
+        legend_lines = max((_named_arrow_count(panel) for panel in panels), default=0)
         height_above = gap / 2 + legend_lines * line_height
         return cls(line_height, cell_width, image_height, height_below, height_above)
 

@@ -290,6 +290,11 @@ def _figure(
     return modes_figure(surfaces, captions, style, camera)
 
 
+def _largest_size(column: str, rows: Sequence[Row]) -> float:
+    """Return the largest absolute value of a column of rows."""
+    return max(abs(float(row[column])) for row in rows)
+
+
 def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
     """Return the distinct instabilities of a path, each with all rows at which the path meets it.
 
@@ -310,9 +315,7 @@ def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
     displacements = [
         name for name in columns_here if quantity(name).kind in ("displacement", "place")
     ]
-    largest_values = {
-        name: max(abs(float(row[name])) for row in singular) for name in displacements
-    }
+    largest_values = {name: _largest_size(name, singular) for name in displacements}
 
     def are_same(row: Row, other: Row) -> bool:
         """Whether two rows are one instability: of one kind, with equal displacements."""

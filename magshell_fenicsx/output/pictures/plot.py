@@ -160,6 +160,13 @@ def plot(
     return [name for name in names if not name.startswith("fields/whole_")]
 
 
+def _is_given(value: object) -> bool:
+    """Return whether an argument is given: one that is not is None, False or an empty list."""
+    if value is None or value is False:
+        return False
+    return value != []
+
+
 def plot_folders(
     folders: Sequence[Path], out: Path, options: Mapping[str, Any], **options_of_one: Any
 ) -> str:
@@ -183,12 +190,7 @@ def plot_folders(
     """
     if len(folders) == 1:
         return f"{', '.join(plot(folders[0], options=options, **options_of_one))} in {folders[0]}/"
-    # arguments that are not given are None, False or empty
-    has_options_of_one = any(
-        value is not None and value is not False and value != []
-        for value in options_of_one.values()
-    )
-    if has_options_of_one:
+    if any(_is_given(value) for value in options_of_one.values()):
         raise CaseError(
             "plot: of several runs the curves are drawn in one picture: give one folder for more"
         )

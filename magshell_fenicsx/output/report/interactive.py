@@ -231,9 +231,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
         "triangles": arrays.raw(mesh.triangles.astype(number_type)),
         "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in surfaces_on_nodes],
         "lines": [_lines(shell) for shell in surfaces_on_nodes],
-        "solids": [
-            [_solid(solid, arrays) for solid in near_solids(shell)] for shell in surfaces_on_nodes
-        ],
+        "solids": [_solids(shell, arrays) for shell in surfaces_on_nodes],
         "fields": _fields(surfaces_on_nodes, mesh, shell_data.h, arrays),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
@@ -244,6 +242,11 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
 def _lines(shell: Surface) -> list[Any]:
     """Return the outlines (n, 3) of bodies and sources near a shell, as lists for JSON."""
     return [np.round(line, 4).tolist() for line in near_outlines(shell)]
+
+
+def _solids(shell: Surface, arrays: "_Packed") -> list[dict[str, Any]]:
+    """Return the bodies and magnets near a shell for the page, as `_solid` does for each."""
+    return [_solid(solid, arrays) for solid in near_solids(shell)]
 
 
 def _solid(solid: Solid, arrays: "_Packed") -> dict[str, Any]:
@@ -289,6 +292,11 @@ def chosen_frames(rows: Sequence[Row], max_rows: int) -> list[Row]:
     )
 
 
+def _numbers_in(row: Row, columns: Sequence[str]) -> list[float]:
+    """Return the numbers of a row in some columns."""
+    return [float(row[name]) for name in columns]
+
+
 def _change_of_shape(rows: Sequence[Row]) -> Array:
     """Return (n,) how far the shape has changed from the first row to each row.
 
@@ -296,14 +304,17 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
     each row. All shares together are half of the sum of all changes.
     """
     columns = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
-    values = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(
-        len(rows), -1
-    )
+    values = np.array([_numbers_in(row, columns) for row in rows]).reshape(len(rows), -1)
     ranges = np.ptp(values, axis=0)
     steps = np.abs(np.diff(values[:, ranges > 0] / ranges[ranges > 0], axis=0)).sum(axis=1)
     # where nothing changes, the sum counts as one, and rows are at equal distances
     share = 0.5 * (float(steps.sum()) or 1.0) / max(len(steps), 1)
     return np.concatenate([[0.0], np.cumsum(steps + share)])
+
+
+def _varies(column: str, rows: Sequence[Row]) -> bool:
+    """Return whether a column has several values in some rows."""
+    return len({row[column] for row in rows}) > 1
 
 
 def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
@@ -331,7 +342,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         quantities |= {q.name: q for q in axes_for(step)}
         axes += [q.name for q in axes_for(step)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
-    varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
+    varying = [name for name in numeric if _varies(name, rows)]
     columns = {}
     for name in dict.fromkeys([*axes, *varying]):
         column_quantity = quantities.get(name) or quantity(name)
@@ -533,10 +544,9 @@ def _values(surface: Surface, name: str, h: float) -> Array | None:
     if name == "w_over_h":
         return np.asarray(surface.w / h)
     values = couple(surface) if name == "couple" else surface.fields.get(name)
-    if values is None and name == "couple" and "Ba" in surface.fields:
-        return np.zeros(len(surface.r0))  # before the field is applied
     if values is None:
-        return None
+        is_before_field = name == "couple" and "Ba" in surface.fields
+        return np.zeros(len(surface.r0)) if is_before_field else None
     return np.nan_to_num(values if values.ndim == 1 else np.linalg.norm(values, axis=1))
 
 

@@ -248,7 +248,8 @@ def _varying_columns(lines: Sequence[Line]) -> list[str]:
         is_repeated = name.startswith("w_") and any(
             _are_equal(values, earlier_values) for earlier_values in displacements
         )
-        if name in ("point", "label") or (len(set(values)) > 1 and not is_repeated):
+        has_new_values = len(set(values)) > 1 and not is_repeated
+        if name in ("point", "label") or has_new_values:
             varying_columns[name] = values
     return list(varying_columns)
 
@@ -436,7 +437,8 @@ def value(line: Line, summary: Summary) -> Markup:
     is_same_number = float(line[shown_column.name]) == float(line[name])
     is_same_in_units = shown_column.symbol == quantity(name).symbol and is_same_number
     is_flat_pressure = name == "p_over_pc" and is_flat(summary["case"])
-    if has_unit and (is_same_in_units or is_flat_pressure):
+    is_clear_in_units = is_same_in_units or is_flat_pressure
+    if has_unit and is_clear_in_units:
         return Markup("{} = {} {}").format(
             head(shown_column), number(float(line[shown_column.name])), shown_column.si
         )

@@ -138,7 +138,9 @@ def _json_object(file: Path) -> dict[str, Any]:
 
 def _is_filled(file: Path) -> bool:
     """Whether there is a file with content, or anything else that is no file."""
-    return file.exists() and (not file.is_file() or file.stat().st_size > 0)
+    if not file.exists():
+        return False
+    return not file.is_file() or file.stat().st_size > 0
 
 
 def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) -> Path:

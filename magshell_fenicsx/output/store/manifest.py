@@ -90,7 +90,10 @@ def files_of_runs(folder: Path) -> set[str]:
     # files of a path; the manifest's own name is in `names` if there is a manifest
     has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
     has_manifest = NAME in names
-    if has_checkpoint or (not has_manifest and is_path(folder / "path.csv")):
+    has_files_of_path = has_checkpoint
+    if not has_checkpoint and not has_manifest:
+        has_files_of_path = is_path(folder / "path.csv")
+    if has_files_of_path:
         names |= {
             name for name in regular_names if name in FILES_OF_PATH or name.startswith("fields/")
         }

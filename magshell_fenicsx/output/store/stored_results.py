@@ -192,6 +192,11 @@ def is_flat(case: Mapping[str, Any]) -> bool:
     return shell_of(case).get("geometry") in FLAT_GEOMETRIES
 
 
+def _ends_on_axis(points: Sequence[Sequence[Any]]) -> bool:
+    """Return whether the last point (rho, z) of a profile, if it has any, is on the axis."""
+    return bool(points) and points[-1][0] == 0
+
+
 def pole_of(case: Mapping[str, Any]) -> str:
     """Return words for the point of `w_pole_over_h` on a shape, where the case names no point.
 
@@ -206,6 +211,6 @@ def pole_of(case: Mapping[str, Any]) -> str:
     if geometry == "cap" and shell.get("hole") is None:
         return POLE
     points = (shell.get("profile") or {}).get("points") or []
-    if geometry == "revolution" and points and points[-1][0] == 0:
+    if geometry == "revolution" and _ends_on_axis(points):
         return POLE
     return POLE_NAMES.get(str(geometry), "the watched point")

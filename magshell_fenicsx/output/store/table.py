@@ -111,6 +111,11 @@ class PathTable:
         self._file.close()
 
 
+def _cells(line: Iterable[Any]) -> list[Any]:
+    """Return the cells of a line of a CSV file, where numbers are texts in full precision."""
+    return [repr(float(v)) if isinstance(v, float) else v for v in line]
+
+
 def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
     r"""Return lines of cells as the text of a CSV file, with numbers in full precision.
 
@@ -121,15 +126,18 @@ def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator=end)
-    writer.writerows(
-        [repr(float(v)) if isinstance(v, float) else v for v in line] for line in lines
-    )
+    writer.writerows(_cells(line) for line in lines)
     return stream.getvalue()
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
     """Write columns of rows as a CSV file with a header; a missing value is left empty."""
-    lines = ([row.get(column, "") for column in columns] for row in rows)
+
+    def values_of(row: Mapping[str, Any]) -> list[Any]:
+        """Return the values of a row in the columns."""
+        return [row.get(column, "") for column in columns]
+
+    lines = map(values_of, rows)
     file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
 
 
@@ -172,10 +180,12 @@ def read_rows(file: Path) -> list[Row]:
     Damaged
         If a column is missing or a line is not from a run; the message names the first such line.
     """
-    return [
-        {key: v if key in TEXTS else _number(v) for key, v in row.items()}
-        for row in read_lines(file)
-    ]
+    return [_row_of_texts(texts) for texts in read_lines(file)]
+
+
+def _row_of_texts(texts: Mapping[str, str]) -> Row:
+    """Return a row of texts with numbers where columns are numbers."""
+    return {key: v if key in TEXTS else _number(v) for key, v in texts.items()}
 
 
 def read_lines(file: Path) -> list[dict[str, str]]:
@@ -214,6 +224,11 @@ def read_lines(file: Path) -> list[dict[str, str]]:
     return rows
 
 
+def _may_have_nan(column: str) -> bool:
+    """Return whether a run may write nan into a column."""
+    return column.startswith(NAN_COLUMNS) or column not in COLUMNS
+
+
 def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
     """Return the first column whose value no run writes; empty if there is none.
 
@@ -229,7 +244,7 @@ def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) 
     for key, text in row.items():
         try:
             value = 0.0 if key in TEXTS else float(text)
-            may_be_nan = isnan(value) and (key.startswith(NAN_COLUMNS) or key not in COLUMNS)
+            may_be_nan = isnan(value) and _may_have_nan(key)
             # infinity is too large, and nan fails the comparison
             if not (abs(value) <= MAX_NUMBER or may_be_nan):
                 return key

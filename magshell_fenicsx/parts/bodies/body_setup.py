@@ -144,7 +144,8 @@ def _place_on_shell(section: BodySection, reference: ReferenceShell, key: str) -
         Key of the body in the case file, for messages.
     """
     has_own_place = section.position is not None and "at" not in section.model_fields_set
-    if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
+    needs_no_normal = reference.geometry == "mesh" or section.direction is not None
+    if has_own_place and needs_no_normal:
         places = reference.perfect.sample()
         from_body = places - np.array(section.position) / reference.R
         return np.asarray(places[np.linalg.norm(from_body, axis=1).argmin()])

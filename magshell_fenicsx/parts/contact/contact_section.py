@@ -210,7 +210,8 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
             # if there are several shells, a name is that of one of them, or of a patch of one
             is_shell = name in (WHOLE_SHELL, *shells)
             is_patch = name.startswith(tuple(f"{shell}_" for shell in shells))
-            if shells and not is_shell and not is_patch:
+            is_known = is_shell or is_patch
+            if shells and not is_known:
                 raise ValueError(
                     f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}"
                 )

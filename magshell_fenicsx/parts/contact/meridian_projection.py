@@ -426,12 +426,11 @@ class MeridianCurves:
                 self._points_of_cells(cells, count, begins, ends, is_first=sides[0])
             )
         # the points of all groups as one set
-        return MeridianPoints(
-            *(
-                np.concatenate([getattr(group, attribute.name) for group in point_groups])
-                for attribute in fields(MeridianPoints)
-            )
-        )
+        arrays = list[Any]()
+        for attribute in fields(MeridianPoints):
+            arrays_of_groups = [getattr(group, attribute.name) for group in point_groups]
+            arrays.append(np.concatenate(arrays_of_groups))
+        return MeridianPoints(*arrays)
 
     def _points_of_cells(
         self, cells: Longs, count: int, begins: bool, ends: bool, is_first: Flags

@@ -139,11 +139,11 @@ class Cells:
         Newton's method starts from the nearest of them. Places are (m, 2), shape functions (m,
         functions).
         """
-        spread = [
-            np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
-            for n in LATTICE_DIVISIONS
-        ]
-        return [(X, self.element.tabulate(0, X)[0, :, :, 0]) for X in spread]
+        lattices = list[tuple[Array, Array]]()
+        for n in LATTICE_DIVISIONS:
+            X = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
+            lattices.append((X, self.element.tabulate(0, X)[0, :, :, 0]))
+        return lattices
 
     @cached_property
     def lebesgue_constant(self) -> float:

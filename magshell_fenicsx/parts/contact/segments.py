@@ -27,6 +27,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,15 @@ HASH_BYTES = 6  # of the hash of a displacement in the number of its cuts
 DIVISION_LEVELS = 16  # of a number of cuts: a float has these and the hash exactly
 # in the reference triangle
 CORNERS_AND_CENTROID = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1 / 3, 1 / 3]])
+
+
+def _joined_arrays(parts: Sequence[Any], names: Sequence[str]) -> list[Any]:
+    """Return the arrays that are attributes of several sets, each joined from all sets."""
+    arrays = list[Any]()
+    for name in names:
+        arrays_of_parts = [getattr(part, name) for part in parts]
+        arrays.append(np.concatenate(arrays_of_parts))
+    return arrays
 
 
 @dataclass(frozen=True)
@@ -110,12 +120,7 @@ class ContactPoints:
     @classmethod
     def concatenate(cls, parts: Sequence["ContactPoints"]) -> "ContactPoints":
         """Return the points of several sets as one set."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, attribute.name) for part in parts])
-                for attribute in fields(cls)
-            )
-        )
+        return cls(*_joined_arrays(parts, [attribute.name for attribute in fields(cls)]))
 
 
 @dataclass(frozen=True)
@@ -144,12 +149,7 @@ class Triangles:
     @classmethod
     def concatenate(cls, parts: Sequence["Triangles"]) -> "Triangles":
         """Return the triangles of several sets as one set."""
-        return cls(
-            *(
-                np.concatenate([getattr(part, attribute.name) for part in parts])
-                for attribute in fields(cls)
-            )
-        )
+        return cls(*_joined_arrays(parts, [attribute.name for attribute in fields(cls)]))
 
     @property
     def size(self) -> Array:

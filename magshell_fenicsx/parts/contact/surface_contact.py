@@ -212,7 +212,8 @@ class SurfaceContact(ContactTerm):
         """
         places, *_ = self._active_set()
         cached_places, cached_stiffness, cached = self._cached_entries
-        if cached_places is places and cached_stiffness == self.stiffness.value and not self.sample:
+        is_current = cached_places is places and cached_stiffness == self.stiffness.value
+        if is_current and not self.sample:
             return cached
         entries = self._entries_by_place_and_offset()
         if self._offsets:

@@ -251,7 +251,7 @@ class DeadSection(PathStep):
         for i, load in enumerate(self.loads):
             if isinstance(load.pressure, str):
                 key = "pressure"
-            elif load.per_area and load.varies and is_normal(load.per_area, outline, length):
+            elif _is_normal_by_components(load, outline, length):
                 key = "per_area"
             else:
                 continue
@@ -324,8 +324,7 @@ class DeadSection(PathStep):
                 mirrors_formula(text, mirror, sampled_places, length) for text in potentials
             )
             return keeps_potentials and all(
-                any(is_image(load, other, mirror, sampled_places, length) for other in self.loads)
-                for load in self.loads
+                _has_image(load, self.loads, mirror, sampled_places, length) for load in self.loads
             )
 
         reason = self._reason_against_turns(vectors, outline.meridian, length)
@@ -356,14 +355,7 @@ class DeadSection(PathStep):
         """
         # whether formulas are the same all around e3; that is known on a meridian alone, and else
         # taken to be so
-        is_axisymmetric = not meridian or (
-            all(load_turns(load, meridian, length) for load in self.loads if load.varies)
-            and all(
-                scalar_is_axisymmetric(load.potential, meridian, length)
-                for load in self.loads
-                if load.potential
-            )
-        )
+        is_axisymmetric = not meridian or self._formulas_are_axisymmetric(meridian, length)
         if any(tilted(v) for v in vectors):
             return "a load is not along e3, or off the axis"
         # `over` names a part that is the same all around e3 if it is "all", or one shell of several
@@ -372,6 +364,15 @@ class DeadSection(PathStep):
         if any(load.over not in (None, "all", *shell_names) for load in self.loads):
             return "a patch is loaded"
         return None if is_axisymmetric else "a load differs around e3"
+
+    def _formulas_are_axisymmetric(self, meridian: MeridianChart, length: float) -> bool:
+        """Return whether the formulas of all loads and potentials are the same all around e3."""
+        loads_turn = all(load_turns(load, meridian, length) for load in self.loads if load.varies)
+        return loads_turn and all(
+            scalar_is_axisymmetric(load.potential, meridian, length)
+            for load in self.loads
+            if load.potential
+        )
 
     def named_points(self) -> list[str]:
         return [load.at for load in self.loads if load.at]
@@ -483,6 +484,20 @@ def is_normal(components: Sequence[Varying], outline: "Outline", length: float) 
     )
 
 
+def _is_normal_by_components(load: DeadLoadSection, outline: "Outline", length: float) -> bool:
+    """Return whether a load has formulas per area that are along the normals (`is_normal`)."""
+    if not load.per_area or not load.varies:
+        return False
+    return is_normal(load.per_area, outline, length)
+
+
+def _has_image(
+    load: DeadLoadSection, loads: Iterable[DeadLoadSection], mirror: Mirror, x: Array, R: float
+) -> bool:
+    """Return whether a plane mirrors a load to one of several (`is_image`)."""
+    return any(is_image(load, other, mirror, x, R) for other in loads)
+
+
 def is_image(
     load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float
 ) -> bool:
@@ -566,7 +581,10 @@ def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
 
     def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
         # x = R Q^T r: coordinates in the case's frame and unit, of a place r in the model's frame
-        x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
+        x = []
+        for i in range(3):
+            coordinate_over_R = sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i])
+            x.append(scale * coordinate_over_R)
         return energy_scale * symbolic(text, symbolic_functions(), *x)
 
     def density(r0: Jet, u: Jet, scale: "Expr", energy_scale: "Expr") -> "Expr":

@@ -130,7 +130,8 @@ class IndentationSection(PathStep):
                 f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}"
             )
         # `highest` has the chart coordinates (2,) of the pole, centre or tip; None without one
-        if outline.highest is None or not (outline.disc or geometry == "strip"):
+        has_pole = outline.disc or geometry == "strip"
+        if outline.highest is None or not has_pole:
             raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
         if not outline.sphere:
             return np.asarray(outline.embedding(outline.highest[None])[0])

@@ -317,6 +317,18 @@ def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, I
     return gradients, is_at_vertex, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
 
+def _is_shared_by_copies(load: DeadLoadSection, modelled: Modelled) -> bool:
+    """Return whether the copies of the modelled part share a force of a load on the whole shell.
+
+    On an edge whose mirror image is another edge there is only the force of that edge, which stays
+    whole.
+    """
+    mirror = modelled.mirror
+    if mirror is None:
+        return False
+    return load.edge is None or mirror.image_of_edge(load.edge) == load.edge
+
+
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
     """Return a load of the case as the model takes it: dimensionless and in the model's frame.
 
@@ -333,11 +345,7 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         The case around the load, and the part of the shell that is modelled.
     """
     mirror = modelled.mirror
-    # the copies share a force on the whole shell; but on an edge whose mirror image is another edge
-    # there is only the force of that edge, which stays whole
-    is_shared = mirror is not None and (
-        load.edge is None or mirror.image_of_edge(load.edge) == load.edge
-    )
+    is_shared = _is_shared_by_copies(load, modelled)
     Q, scales = rotation(modelled.turn), context.scales
     E, thickness, R = scales.E, scales.h, scales.R
     # loads by formula: of the deformed place, or of the undeformed one

@@ -188,7 +188,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     place_columns = None
     for names_of_kind in PLACES:
         is_complete = set(names_of_kind) <= columns.keys()
-        if is_complete and ("w0" in columns or len(names_of_kind) == 3):
+        has_deviations = "w0" in columns or len(names_of_kind) == 3
+        if is_complete and has_deviations:
             place_columns = names_of_kind
             break
     if place_columns is None:
@@ -200,7 +201,8 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     names = [*place_columns, *(["w0"] if "w0" in columns else [])]
     # w0 without a unit is over h: beside places with a unit that is most likely a mistake
     lengths_have_units = any(units[name] for name in place_columns if name not in ANGLES)
-    if "w0" in units and units["w0"] is None and lengths_have_units:
+    w0_lacks_unit = "w0" in units and units["w0"] is None
+    if w0_lacks_unit and lengths_have_units:
         raise TableError(
             "column w0: has no unit, but the places have one: write w0 [h] or a length, such as "
             "w0 [um]"

@@ -119,4 +119,7 @@ def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str,
         # the number of its item: "imperfections.0.dimples.3"
         return item is None or f"{key}.".startswith(f"imperfections.{item}.")
 
-    return {name: [key for key in keys if grows(key, item)] for name, item in items.items()}
+    grown_keys = dict[str, list[str]]()
+    for name, item in items.items():
+        grown_keys[name] = [key for key in keys if grows(key, item)]
+    return grown_keys

@@ -297,6 +297,15 @@ def on_meridian(places: Array, f: Array, m: int) -> Round:
     return Round(fit_scattered(places, f, places, noise=0), m)
 
 
+def _is_finite_mode(r0: Array, w: Array) -> bool:
+    """Return whether arrays are places (n, 3) and deflections (n,), finite and not all zero."""
+    has_places = r0.shape == (len(w), 3)
+    if not has_places:
+        return False
+    is_finite = np.isfinite(r0).all() and np.isfinite(w).all()
+    return bool(is_finite and np.abs(w).max() > 0)
+
+
 def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
     """Return the mode in the file of a section as a function of places over R.
 
@@ -322,10 +331,7 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
         raise CaseError(
             f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {message}"
         ) from None
-    has_places = r0.shape == (len(w), 3)
-    if not has_places or not (
-        np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0
-    ):
+    if not _is_finite_mode(r0, w):
         raise CaseError(f"{key}: the mode has no finite displacement")
     distance_to_node, _ = scipy.spatial.cKDTree(r0).query(sample)
     if distance_to_node.max() > MAX_DISTANCE_OVER_R:

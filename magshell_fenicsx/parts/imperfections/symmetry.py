@@ -134,8 +134,10 @@ class _Sum:
         None means that the deviations must be compared by their values at many places.
         """
         numbers = self.numbers
+        if numbers is None:
+            return None
         # only a plane through the origin maps unit vectors to unit vectors
-        if numbers is None or (numbers.angles and mirror.offset):
+        if numbers.angles and mirror.offset:
             return None
         # the deviation that lies nearest to the mirror image of each one
         rows, depths = numbers.rows, numbers.depths
@@ -215,9 +217,10 @@ def imperfection_constraints(
 
 def _differ_around_e3(groups: Sequence[_Sum], places: Array) -> bool:
     """Return whether a sum of deviations changes where places (n, 3) turn about e3."""
-    w0_at_angles = [
-        np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
-    ]
+    w0_at_angles = list[Array]()
+    for a in ANGLES[:24]:
+        w0_of_groups = [group(places @ rotation(a)) for group in groups]
+        w0_at_angles.append(np.concatenate(w0_of_groups))
     return not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles)
 
 

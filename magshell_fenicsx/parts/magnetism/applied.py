@@ -217,7 +217,9 @@ class AppliedField:
         for at_places in self._fields_at_places:
             # a field that does not depend on the amplitudes has no derivative by them
             names = at_places.moving_field.names
-            if name not in names or (other and other not in names):
+            if name not in names:
+                continue
+            if other and other not in names:
                 continue
             if other:
                 values[..., 6:9] += at_places.second_derivative(name, other).reshape(*shape, 3)

@@ -132,6 +132,11 @@ def pair_derivatives(
     return by_left, by_right
 
 
+def _values_and_rates(places: list[Complex]) -> list[tuple[Array, Array]]:
+    """Return the value and the rate along v of each component of complex places."""
+    return [(np.ascontiguousarray(values.real), values.imag / COMPLEX_STEP) for values in places]
+
+
 def _by_charges(
     x: Components, y: Components, q: Array, p: Array, weights: Weights
 ) -> tuple[Array, Array]:
@@ -141,21 +146,18 @@ def _by_charges(
     kernel is 1/|d|; its rate along v is -d . d'/|d|³, with the rate d' of d.
     """
     # of each side the components of places, as pairs of value and rate along v
-    left_pairs, right_pairs = (
-        [
-            (np.ascontiguousarray(values.real), values.imag / COMPLEX_STEP)
-            for values in places_of_side
-        ]
-        for places_of_side, _ in (x, y)
-    )
-    # components of d and d', each (n, 1 or P, left charges, right charges)
-    separation, rate = (
-        [
+    (places_of_left, _), (places_of_right, _) = x, y
+    left_pairs, right_pairs = _values_and_rates(places_of_left), _values_and_rates(places_of_right)
+
+    def differences(i: int) -> list[Array]:
+        """Return the components of d (i = 0) or d' (i = 1) of all left and right charges."""
+        return [
             a[i][..., :, None] - b[i][..., None, :]
             for a, b in zip(left_pairs, right_pairs, strict=True)
         ]
-        for i in range(2)
-    )
+
+    # each (n, 1 or P, left charges, right charges)
+    separation, rate = differences(0), differences(1)
     inverse = 1 / np.sqrt(separation[0] ** 2 + separation[1] ** 2 + separation[2] ** 2)
     radial_rate = separation[0] * rate[0] + separation[1] * rate[1] + separation[2] * rate[2]
     kernel = weights.energy * inverse - weights.force * inverse**2 * inverse * radial_rate

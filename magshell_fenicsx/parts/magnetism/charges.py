@@ -596,10 +596,12 @@ def _point_charges(
         """
         # the place of a charge is x = r + height n, so that dJ/dr = dJ/dx, dJ/dn = height dJ/dx
         heights = np.stack([eta * thickness + 0 * jets.r[0][..., :1] for eta, _ in layers], axis=2)
-        by_B = [  # by B and its two derivatives
-            sum(on_q[:, :, layer, None] * factors[j] for layer, (_, factors) in enumerate(layers))
-            for j in range(3)
-        ]
+        by_B = []  # by B and its two derivatives
+        for j in range(3):
+            by_layers = (
+                on_q[:, :, layer, None] * factors[j] for layer, (_, factors) in enumerate(layers)
+            )
+            by_B.append(sum(by_layers))
         jets.add_derivatives(
             nodal_derivatives,
             by_place=on_x.sum(axis=2),
@@ -621,10 +623,10 @@ def _charges_of_layers(layers: list[Layer], B: Array) -> Array:
 
     B (3, n, m, 3) are the remanence and its derivatives by a and b.
     """
-    charges_of_layers = [
-        sum(np.sum(factor * b, axis=-1) for factor, b in zip(factors, B, strict=True))
-        for _, factors in layers
-    ]
+    charges_of_layers = []
+    for _, factors in layers:
+        charges = (np.sum(factor * b, axis=-1) for factor, b in zip(factors, B, strict=True))
+        charges_of_layers.append(sum(charges))
     return np.stack(charges_of_layers, axis=2)
 
 

@@ -139,9 +139,11 @@ def unit_of_readings(context: Context) -> str:
     without remanence.
     """
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
-    if magnetic and magnetic.remanent is None:
+    if not magnetic:
+        return "|Br|"
+    if magnetic.remanent is None:
         return "T" if E and magnetic.lambda_m is None else "sqrt(mu0 E)"
-    return "T" if magnetic and magnetic.remanent and magnetic.remanent.flux_density else "|Br|"
+    return "T" if magnetic.remanent.flux_density else "|Br|"
 
 
 class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
@@ -153,7 +155,8 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
         """Refuse maps where nothing is magnetised, and names that no file can have."""
         refuse_unfit_reading(self.key, context)
         for name in self.sections:
-            if not (name.isascii() and name.isidentifier() and len(name) <= MAX_NAME_LENGTH):
+            is_word = name.isascii() and name.isidentifier()
+            if not is_word or len(name) > MAX_NAME_LENGTH:
                 raise ValueError(
                     f"field_maps: {name}: a name is made of at most {MAX_NAME_LENGTH} letters, "
                     "digits and _, as it is in names of files"

@@ -86,7 +86,8 @@ class AppliedSection(Direction):
             "gradient",
             "components",
         } & self.model_fields_set
-        if self.sources and self.flux_density is None and other_keys:
+        has_sources_alone = bool(self.sources) and self.flux_density is None
+        if has_sources_alone and other_keys:
             raise ValueError(
                 f"{', '.join(sorted(other_keys))}: of a field beside the sources: give its "
                 "flux_density too"
@@ -114,7 +115,7 @@ class AppliedSection(Direction):
     @property
     def is_uniform(self) -> bool:
         """Whether the applied field is the same everywhere."""
-        return not (self.gradient or self.components or self.sources)
+        return not any((self.gradient, self.components, self.sources))
 
     @property
     def reference(self) -> float | None:
@@ -144,11 +145,8 @@ def _of_places(value: Any) -> Any:
         raise ValueError("a mapping names at least one patch")
     else:
         for number in value.values() if isinstance(value, dict) else [value]:
-            if (
-                isinstance(number, bool)
-                or not isinstance(number, int | float)
-                or not 0 <= number <= MAX_SUSCEPTIBILITY
-            ):
+            is_number = isinstance(number, int | float) and not isinstance(number, bool)
+            if not is_number or not 0 <= number <= MAX_SUSCEPTIBILITY:
                 raise ValueError(
                     f"{number!r}: allowed are numbers from 0 to {MAX_SUSCEPTIBILITY:g}, and "
                     "formulas of x, y, z"
@@ -202,11 +200,9 @@ class MagneticSection(Section, Ability):
 
         So a soft shell has no remanence by default, and any other shell has one along e3.
         """
-        if (
-            isinstance(data, dict)
-            and data.get("susceptibility") is not None
-            and "remanent" not in data
-        ):
+        if not isinstance(data, dict):
+            return data
+        if data.get("susceptibility") is not None and "remanent" not in data:
             return {**data, "remanent": None}
         return data
 
@@ -218,9 +214,8 @@ class MagneticSection(Section, Ability):
                 "remanent: none is of a shell with a susceptibility: give that, or leave remanent "
                 "out"
             )
-        if self.saturation is not None and (
-            self.susceptibility is None or self.lambda_m is not None
-        ):
+        is_soft_in_tesla = self.susceptibility is not None and self.lambda_m is None
+        if self.saturation is not None and not is_soft_in_tesla:
             raise ValueError(
                 "saturation: is of a shell with a susceptibility in a field in tesla: give "
                 "susceptibility and applied.flux_density (or sources), without lambda_m"
@@ -230,7 +225,8 @@ class MagneticSection(Section, Ability):
                 f"energy: {self.energy}: the expansions are of a remanence: susceptibility needs "
                 "full"
             )
-        if self.susceptibility is not None and self.remanent and self.lambda_m is not None:
+        is_soft_with_remanence = self.susceptibility is not None and bool(self.remanent)
+        if is_soft_with_remanence and self.lambda_m is not None:
             raise ValueError(
                 "susceptibility: beside a remanence lambda_m does not say how strong the field "
                 "is: give remanent.flux_density and applied.flux_density"
@@ -281,7 +277,8 @@ class MagneticSection(Section, Ability):
                 "remanence: is a law of a field, and there is none: give lambda_m or flux "
                 "densities too"
             )
-        if self.lambda_m is None and None in densities and not self.without_field:
+        strength_is_unknown = self.lambda_m is None and None in densities
+        if strength_is_unknown and not self.without_field:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError(
@@ -302,12 +299,9 @@ class MagneticSection(Section, Ability):
         only read by sensors, or its parts act on each other.
         """
         keys_given = self.model_fields_set
-        return (
-            self.remanent is not None
-            and self.lambda_m is None
-            and "remanent" in keys_given
-            and "applied" not in keys_given
-        )
+        has_remanence = self.remanent is not None and "remanent" in keys_given
+        has_field = self.lambda_m is not None or "applied" in keys_given
+        return has_remanence and not has_field
 
     def _one_field(self) -> None:
         """Refuse keys of a remanence for a shell that is soft alone."""
@@ -367,12 +361,14 @@ class MagneticSection(Section, Ability):
                 "shell's lengths units"
             )
         by_densities = self.lambda_m is None and not self.without_field
-        if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
+        lacks_units = isinstance(shell, SurfaceSection) and not shell.with_units
+        if by_densities and lacks_units:
             raise ValueError(
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give "
                 "youngs_modulus and lengths units, or lambda_m"
             )
-        if self.without_field and not is_read(context) and self.interaction == "none":
+        is_unread = self.without_field and not is_read(context)
+        if is_unread and self.interaction == "none":
             raise ValueError(
                 "magnetic: give lambda_m, or remanent.flux_density and applied.flux_density"
             )
@@ -392,18 +388,8 @@ class MagneticSection(Section, Ability):
                 "a thickness that does not change",
                 hint="or give energy: full",
             )
-        if self.remanent and isinstance(self.remanent.components, UserField):
-            context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
-        # of a layered remanence a shell has the average over the thickness alone, a solid has all
-        layers = self.remanent.layers if self.remanent else None
-        if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
-            raise ValueError(
-                "magnetic.remanent.layers: the layers cancel: their average is a remanence of "
-                "length zero, and a shell knows no more of them"
-            )
-        patches = self.remanent.patches if self.remanent else None
-        if patches is not None and "rest" not in patches and not isinstance(shell, MeshSurface):
-            raise ValueError("magnetic.remanent: patches needs the patch rest")
+        if self.remanent:
+            _refuse_unfit_remanence(self.remanent, context)
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime:
         """Return the field as a load that may be a function of time.
@@ -442,7 +428,8 @@ class MagneticSection(Section, Ability):
             [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         )
         # whether the magnetisation matters: a field acts on it, it is read, or parts interact
-        is_visible = strength(context) or is_read(context) or interacting
+        is_driven_or_read = strength(context) or is_read(context)
+        is_visible = is_driven_or_read or interacting
         return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
@@ -579,12 +566,32 @@ class MagneticSection(Section, Ability):
         It is a flux density in mT (`applied`). If sources are the whole field, it is their strength
         in percent of the strength in the case (`strength`).
         """
+        if isnan(units.E) or self.without_field:
+            return units
         remanence_is_known = self.remanent is None or bool(self.remanent.flux_density)
-        if isnan(units.E) or self.without_field or not remanence_is_known:
+        if not remanence_is_known:
             return units
         if self.applied.has_field_beside_sources:
             return replace(units, applied=1e3 * self.tesla(units.E))
         return replace(units, strength=100 / strength(context))
+
+
+def _refuse_unfit_remanence(remanent: RemanentSection, context: Context) -> None:
+    """Refuse a remanence that the case's shell or solid does not allow."""
+    if isinstance(remanent.components, UserField):
+        context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
+    # of a layered remanence a shell has the average over the thickness alone, a solid has all
+    layers = remanent.layers
+    if layers and not context.solid:
+        size_of_average = np.linalg.norm(layer_average(layers))
+        if size_of_average < 1e-9:
+            raise ValueError(
+                "magnetic.remanent.layers: the layers cancel: their average is a remanence of "
+                "length zero, and a shell knows no more of them"
+            )
+    lacks_rest = remanent.patches is not None and "rest" not in remanent.patches
+    if lacks_rest and not isinstance(context.shell, MeshSurface):
+        raise ValueError("magnetic.remanent: patches needs the patch rest")
 
 
 def strength(context: Context) -> float:

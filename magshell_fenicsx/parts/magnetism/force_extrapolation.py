@@ -202,10 +202,11 @@ class ForceExtrapolation:
         )
         self._model = None
         self._products.clear()
-        self._points = [
-            [ForceState(state.u, state.forces, self._product(state.u)) for state in point]
-            for point in self._points
-        ]
+        self._points = [self._with_products(states) for states in self._points]
+
+    def _with_products(self, states: list[ForceState]) -> list[ForceState]:
+        """Return the states of a point with their products by the present D."""
+        return [ForceState(state.u, state.forces, self._product(state.u)) for state in states]
 
     def _make_model(self) -> tuple["PathPolynomial", list[tuple[Array, Array]]]:
         """Return the polynomial along the path, and secant corrections.

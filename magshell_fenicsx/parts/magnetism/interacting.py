@@ -287,8 +287,11 @@ class InteractionTerm:
         nodes = self._nodes()
         latest = self._latest_hessians  # nodes, both second derivatives, and u there
         # if `inexact`, those at any earlier nodes will do
-        if latest is None or not (inexact or np.array_equal(nodes, latest[0])):
-            latest = self._latest_hessians = None  # the old ones free their memory first
+        if latest is not None and not inexact:
+            has_present_nodes = np.array_equal(nodes, latest[0])
+            latest = latest if has_present_nodes else None
+        if latest is None:
+            self._latest_hessians = None  # the old ones free their memory first
             latest = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
             self._latest_hessians = latest
         _, even_and_odd, _ = latest

@@ -122,7 +122,8 @@ def refuse_unfit_interaction(context: Context) -> None:
     magnetic = context.section_of(MagneticSection)
     if magnetic is None or not acts(context):
         return
-    if not (context.shell.youngs_modulus and magnetic.remanent and magnetic.remanent.flux_density):
+    has_flux_density = bool(magnetic.remanent and magnetic.remanent.flux_density)
+    if not context.shell.youngs_modulus or not has_flux_density:
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: how strong it is follows from "
             "remanent.flux_density and shell.youngs_modulus: give both"

@@ -210,8 +210,9 @@ def soft_magnet(
         pattern = WithinRims(rims, rest_value) if rims else float(rest_value[0])
     # |Ba| over sqrt(mu_0 E) for lambda_m = 1: a soft energy is quadratic in the field itself
     scale = 1.0
-    if remanent and remanent.flux_density and E:
-        scale = sqrt(MU_0 * E) / remanent.flux_density
+    remanent_flux_density = remanent.flux_density if remanent else None
+    if remanent_flux_density and E:
+        scale = sqrt(MU_0 * E) / remanent_flux_density
     # T for lambda_m = 1
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
     largest_polarisation = None if magnetic.saturation is None else magnetic.saturation / tesla
@@ -328,17 +329,19 @@ class _MagneticVectors:
             *((field, x) for field in self.fields),
             *((field, some_places) for field in self.sources),
         ]
-        uniform = all(
+        vectors_have_images = all(
             np.abs(S @ v - sign * v).max() <= MIRROR_TOLERANCE
             for v in (*self.vectors, *self.turned_directions)
         )
-        varying = all(
+        fields_have_images = all(
             equal_to_rounding(
                 sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
             )
             for field, places in places_of_fields
         )
-        return uniform and varying and self._patterns_have_images(S, sign)
+        if not vectors_have_images or not fields_have_images:
+            return False
+        return self._patterns_have_images(S, sign)
 
     def _patterns_have_images(self, S: Array, sign: float) -> bool:
         """Return whether radial and tangential remanences are mapped to `sign` times themselves.
@@ -390,7 +393,8 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
     remanences = [_on_patch(direction, context, turn=0.0) for direction in directions]
     # uniform vectors: of the remanence, and of a uniform applied field
     vectors = [remanence for remanence in remanences if not callable(remanence)]
-    if applied.has_field_beside_sources and not formulas and strength(context):
+    has_uniform_field = applied.has_field_beside_sources and not formulas
+    if has_uniform_field and strength(context):
         vectors.append(applied.vector())
     remanent = remanent or RemanentSection.model_construct()
     assert not isinstance(remanent.components, UserField)  # has no symmetry, see the caller
@@ -531,7 +535,9 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     (constraint,) = remanence_constraints(context, modelled.outline)
     # whether an axisymmetric model can represent the remanence; other models always can
     is_visible = constraint.not_axisymmetric is None or not modelled.axisymmetric
-    if not is_visible or (modelled.plane and not constraint.mirrors(modelled.plane)):
+    if not is_visible:
+        return observed
+    if modelled.plane and not constraint.mirrors(modelled.plane):
         return observed
     return {"remanence": magnetisation(magnetic, context, turn, patch_rims), **observed}
 

@@ -311,11 +311,12 @@ class SurfaceJets:
         `by_jets` and `by_B` (3, n, m, 3) are its derivatives by the jets of the deformed place and
         of the remanence: by value, by the derivative along the meridian, by that around the axis.
         """
-        # back to azimuth zero, where nodal values have their components
-        by_jets, by_B = (
-            np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
-            for derivatives in (by_jets, by_B)
-        )
+
+        def at_azimuth_zero(derivatives: Array) -> Array:
+            """Return derivatives turned back to where nodal values have their components."""
+            return np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
+
+        by_jets, by_B = at_azimuth_zero(by_jets), at_azimuth_zero(by_B)
         full_turn = 2 * np.pi
         # a place (U, 0, W) has the derivative (0, U, 0) around the axis, times the full turn: to
         # the derivatives by U and W, and by their slopes, it adds one by U

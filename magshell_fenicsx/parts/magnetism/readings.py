@@ -240,7 +240,9 @@ class SensorsObservables(Observables):
         from magshell_fenicsx.parts.magnetism.self_field import DIFFERENCE_STEP, DIFFERENCE_WEIGHTS
 
         applied = view.loads.magnetic
-        if not (applied and (sensor.total or applied.soft)):
+        if not applied:
+            return {}
+        if not sensor.total and not applied.soft:
             return {}
         names_of_motions = (name for moving_field in applied.driven for name in moving_field.names)
         names = {"lambda_m", *TRANSVERSE_AMPLITUDES, *names_of_motions}

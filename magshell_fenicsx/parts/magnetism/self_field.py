@@ -468,8 +468,10 @@ class SelfField:
         collective.
         """
         sign = self._image_sign
+        if sign != 0.0:
+            return sign
         magnetic, mirror = self._sight.loads.magnetic, self._sight.mirror
-        if sign == 0.0 and magnetic and mirror:
+        if magnetic and mirror:
             # a field of amplitude zero has no sign; an amplitude of one has the same symmetry
             amplitudes = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
             return magnetic.sign_of_images(amplitudes, self._sight.model.r0, mirror)
@@ -577,9 +579,8 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
     )
     on_all_ranks = system.comm.allgather(on_rank)
     triangles_and_charges = [chunk for chunks in on_all_ranks for chunk in chunks]
-    corners, charges = (
-        np.concatenate([chunk[i] for chunk in triangles_and_charges]) for i in range(2)
-    )
+    corners = np.concatenate([triangles for triangles, _ in triangles_and_charges])
+    charges = np.concatenate([charges_of_chunk for _, charges_of_chunk in triangles_and_charges])
     corners = R * corners @ Q
     area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     # a polarisation normal to a triangle gives it a charge per area of its size

@@ -252,9 +252,8 @@ class SingularPairs:
         - ("strips", edge of c, where they touch, edge of d, and there: `flip`, or the common end of
           the edge of d and of c, 0 or 1).
         """
-        own_corners, other_corners = (
-            [int(corner) for corner in self._corners[cell]] for cell in (c, d)
-        )
+        own_corners = list(map(int, self._corners[c]))
+        other_corners = list(map(int, self._corners[d]))
         yield self._kind_of_faces(c, d)
         for edge in map(int, np.flatnonzero(self._strips[c])):
             # the strip of the first cell with the faces of the second
@@ -309,11 +308,7 @@ class SingularPairs:
             own_count = sum(c in self._own for c, _ in pairs)
             batches.append(self._batch(kind, np.array(own_first, dtype=np.int64), own_count))
 
-        # the largest charges on the first and on the second elements of each batch
-        charges_of_batches = [
-            [float(np.abs(q).max(initial=0.0)) for q in (batch.left.q, batch.right.q)]
-            for batch in batches
-        ]
+        charges_of_batches = [_largest_charges(batch) for batch in batches]
         largest = max((charge for charges in charges_of_batches for charge in charges), default=0)
         for batch, charges in zip(batches, charges_of_batches, strict=True):
             is_charged = all(charge > CHARGE_TOLERANCE * largest for charge in charges)
@@ -628,20 +623,26 @@ class SingularPairs:
             self._shape.add_thickness_derivatives(cells, places.X, by_thickness, nodal_derivatives)
 
 
+def _largest_charges(batch: Batch) -> list[float]:
+    """Return the largest charge on the first and on the second elements of a batch."""
+    return [float(np.abs(q).max(initial=0.0)) for q in (batch.left.q, batch.right.q)]
+
+
 def _cells_with_common_corner(corners: Ints) -> list[list[int]]:
     """Return for each cell the cells with a common corner, itself included, in ascending order.
 
     `corners` (cells, 3) are the numbers of the cells' corners.
     """
-    corner_numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
+    corner_numbers: list[list[int]] = corners.tolist()
     cells_at_corner: dict[int, list[int]] = {}
     for cell, corners_of_cell in enumerate(corner_numbers):
         for corner in corners_of_cell:
             cells_at_corner.setdefault(corner, []).append(cell)
-    return [
-        sorted({neighbour for corner in corners_of_cell for neighbour in cells_at_corner[corner]})
-        for corners_of_cell in corner_numbers
-    ]
+    neighbours_of_cells = list[list[int]]()
+    for corners_of_cell in corner_numbers:
+        neighbours = {cell for corner in corners_of_cell for cell in cells_at_corner[corner]}
+        neighbours_of_cells.append(sorted(neighbours))
+    return neighbours_of_cells
 
 
 def _basis(points: Places) -> Array:

@@ -77,7 +77,8 @@ class SourceStep(LoadStep):
         ]
         if len(changes) != 1:
             raise ValueError("give one of move, to, turn and strength")
-        if self.strength == 1 or (self.move and not any(self.move)):
+        has_zero_move = bool(self.move) and not any(self.move or [])
+        if self.strength == 1 or has_zero_move:
             raise ValueError(f"{changes[0]}: changes nothing")
         if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"source"}):
             raise ValueError(

@@ -133,7 +133,9 @@ def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
     if len(sides) == 1:
         (apex,) = (CORNERS[i] for i in range(3) if i not in sides[0])
     elif len(sides) == 2:
-        apex = CORNERS[[i for i in range(3) if not all(i in side for side in sides)]].mean(axis=0)
+        first_side, second_side = sides
+        ends_of_third = [i for i in range(3) if i not in first_side or i not in second_side]
+        apex = CORNERS[ends_of_third].mean(axis=0)
     # coordinates and weights: a from a side to the apex, dense at the side, and b along the side
     (a, wa), (b, wb) = graded(ROWS_AT_EDGE, s), gauss(POINTS_ALONG_ROWS)  # both on [0, 1]
     points, weights = list[Array](), list[Array]()

@@ -155,9 +155,13 @@ def curve(history: History, time: Value, level: Value, start: float) -> Curve:
         return lambda t, before: float(start + (end_value - start) * min(t / duration, 1.0))
     if isinstance(history, StepHistory):
         jump_time, end_value = time(history.at), level(history.to)
-        return lambda t, before: (
-            end_value if t > jump_time or (t == jump_time and not before) else start
-        )
+
+        def jump(t: float, before: bool) -> float:
+            if t == jump_time:
+                return start if before else end_value
+            return end_value if t > jump_time else start
+
+        return jump
     if isinstance(history, WaveHistory):
         return _wave(history, time, level)
     return _interpolation([time(t) for t, _ in history], [level(v) for _, v in history])

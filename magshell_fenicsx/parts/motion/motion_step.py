@@ -123,20 +123,22 @@ class TimeSection(Step):
             if value is None:  # not given
                 continue
             number = in_units("1/second" if key == "drag" else "second")(value)
-            if number < 0 or (number == 0 and key != "drag"):
+            is_too_small = number < 0 if key == "drag" else number <= 0
+            if is_too_small:
                 raise ValueError(f"{key}: {value}: must be positive")
         for name, history in self.history.items():
             times = [float(in_units("second")(t)) for t in times_of(history)]
-            if isinstance(history, list) and (times[0] < 0 or times != sorted(times)):
-                raise ValueError(
-                    f"history.{name}: the times of a table must not fall, nor be negative"
-                )
+            if isinstance(history, list):
+                if times[0] < 0 or times != sorted(times):
+                    raise ValueError(
+                        f"history.{name}: the times of a table must not fall, nor be negative"
+                    )
+                continue
             # a jump may be at time zero, but the length of a ramp and the period of a wave are
             # positive; a formula has no times
             jumps, least_time = getattr(history, "kind", "") == "step", min(times, default=1.0)
-            if not isinstance(history, list) and (
-                least_time < 0 or (least_time == 0 and not jumps)
-            ):
+            is_too_early = least_time < 0 if jumps else least_time <= 0
+            if is_too_early:
                 raise ValueError(f"history.{name}: times must be positive")
         return self
 
@@ -162,7 +164,8 @@ class TimeSection(Step):
     @property
     def needs_inertia_alone(self) -> bool:
         """Whether the step needs neither an equilibrium nor a mode: then the shell may be free."""
-        return self.until in ("duration", "event") and self.push is None and not self.hold
+        needs_equilibrium_or_mode = self.push is not None or bool(self.hold)
+        return self.until in ("duration", "event") and not needs_equilibrium_or_mode
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         """Check that the case has the loads whose histories the step gives, in units that it knows.
@@ -214,7 +217,9 @@ class TimeSection(Step):
             times = [t for t, _ in history] if isinstance(history, list) else []
             # two rows of a table at one time are a jump
             jumps = getattr(history, "kind", "") == "step" or len(set(times)) < len(times)
-            if jumps and name in loads and not loads[name].jumps:
+            load = loads.get(name)
+            cannot_jump = load is not None and not load.jumps
+            if jumps and cannot_jump:
                 raise ValueError(f"{key}.history.{name}: a support cannot jump")
             # values must have a unit that the load knows
             for level in levels_of(history):

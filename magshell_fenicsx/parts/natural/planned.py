@@ -122,12 +122,12 @@ def first_direction(context: Context) -> list[float | str] | str:
 
     Without a natural shape, or without its key `along`, it is the default of the geometry.
     """
-    is_flat = isinstance(context.shell, MeshSurface | PlateSurface)
-    is_flat = is_flat or (
-        isinstance(context.shell, ShellSection) and context.shell.geometry == "strip"
-    )
     natural = context.section_of(NaturalSection)
-    return (natural and natural.along) or ([1.0, 0.0, 0.0] if is_flat else MERIDIAN)
+    if natural and natural.along:
+        return natural.along
+    is_strip = isinstance(context.shell, ShellSection) and context.shell.geometry == "strip"
+    is_flat = is_strip or isinstance(context.shell, MeshSurface | PlateSurface)
+    return [1.0, 0.0, 0.0] if is_flat else MERIDIAN
 
 
 def is_anisotropic(context: Context) -> bool:
@@ -162,7 +162,8 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
         return "the natural curvature twists: k12 is not zero"
     # along the meridians are the direction "meridian" and the part of e3 in the surface
     is_vertical = [v == 0 for v in direction] == [True, True, False]
-    if is_anisotropic(context) and direction != MERIDIAN and not is_vertical:
+    is_along_meridians = direction == MERIDIAN or is_vertical
+    if is_anisotropic(context) and not is_along_meridians:
         return "the natural shape is not along the meridians"
     if outline.meridian and not all(
         scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts
@@ -224,11 +225,13 @@ def _is_frame_mirrored(
     # meridians are mirrored by a plane that contains the axis, or is normal to it
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-    # a direction by numbers or formulas: t1 and -t1 are the same frame, as tensors have it
-    directions, directions_at_images = (
-        np.stack([formula_function(v)(*(R * p).T) for v in direction], -1)
-        for p in (x, mirror.image(x))
-    )
+
+    def directions_at(places: Array) -> Array:
+        """Return the first direction (n, 3), by numbers or formulas, at places (n, 3) over R."""
+        return np.stack([formula_function(v)(*(R * places).T) for v in direction], -1)
+
+    # t1 and -t1 are the same frame, as tensors have it
+    directions, directions_at_images = directions_at(x), directions_at(mirror.image(x))
     mirrored_directions = directions @ mirror.reflection
     tolerance = EQUALITY_TOLERANCE * np.abs(directions).max()
     return any(

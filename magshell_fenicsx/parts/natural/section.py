@@ -42,9 +42,11 @@ def per_length(value: Any) -> Any:
     Formulas such as "5/x" are left as they are.
     """
     matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
+    if not matched:
+        return value
     # the unit below a stroke, as in 5/m, or with the power -1
-    unit = matched and (matched["below"] or matched["power"])
-    if not matched or unit in PLACE:  # in 5/x, x is a coordinate and no unit
+    unit = matched["below"] or matched["power"]
+    if unit in PLACE:  # in 5/x, x is a coordinate and no unit
         return value
     return in_units("1/metre")(f"{matched['number']} {unit}**-1")
 
@@ -72,11 +74,9 @@ def _components(
         value = per_length(value) if lengths else value
         if isinstance(value, str):
             formula(value)  # raises if it is none
-        elif (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not minimum <= value <= maximum
-        ):
+            return value
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not minimum <= value <= maximum:
             raise ValueError(
                 f"{value!r}: allowed are numbers from {minimum:g} to {maximum:g}, and formulas of "
                 "x, y, z"

@@ -118,7 +118,8 @@ def edge_openings(
     # the sides of an edge are its facets; an edge moves if it does on any rank
     sides = {name: set(map(int, facets)) for name, facets in edges.items()}
     moving_on_ranks = comm.allgather(moving_edges(sides, conditions))
-    names = [name for name in edges if any(name in moving for moving in moving_on_ranks)]
+    moving_names = set[str]().union(*moving_on_ranks)
+    names = [name for name in edges if name in moving_names]
     return names, without_potential(names, conditions, places)
 
 
@@ -158,14 +159,12 @@ def pressed_parts(
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
 
-    def is_pressed(facet: int) -> bool:
+    def select_pressed(facets: NDArray[np.int32]) -> NDArray[np.int32]:
         # a facet of an edge has one cell
-        return bool(sides[links.links(facet)[0]])
+        is_pressed = [bool(sides[links.links(facet)[0]]) for facet in facets]
+        return facets[np.array(is_pressed, dtype=bool)]
 
-    return {
-        name: facets[np.array([is_pressed(f) for f in facets], dtype=bool)]
-        for name, facets in edges.items()
-    }
+    return {name: select_pressed(facets) for name, facets in edges.items()}
 
 
 def side_of(end: str, sides: Mapping[str, float]) -> float:

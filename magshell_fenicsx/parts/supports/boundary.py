@@ -58,9 +58,9 @@ def _condition(value: Any) -> Any:
     ValueError
         With what is allowed, in one message for all kinds of conditions.
     """
-    if isinstance(value, HeldSection) or (
-        isinstance(value, str) and value in get_args(EdgeCondition)
-    ):
+    if isinstance(value, HeldSection):
+        return value
+    if isinstance(value, str) and value in get_args(EdgeCondition):
         return value
     if isinstance(value, dict) and set(value) == {"held"}:
         try:

@@ -205,7 +205,8 @@ def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMo
 def sideways(load: EdgeSection) -> str | None:
     """Return why the motion of supports is not axisymmetric about e3; None if it is."""
     for move in load.moves:
-        if move.rotation or (move.translation and any(move.translation[:2])):
+        has_shift_across = any((move.translation or [])[:2])
+        if move.rotation or has_shift_across:
             return f"the motion of {move.supports[0]} is not along e3"
     return None
 
@@ -251,4 +252,4 @@ def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
     axis = second.turn / (np.linalg.norm(second.turn) or 1.0)
     offset = mirror.image(first.centre) - second.centre
     has_axis = not second.turns or np.abs(offset - (offset @ axis) * axis).max() < ROUNDING
-    return bool(has_shift and has_turn and has_axis)
+    return all((has_shift, has_turn, has_axis))

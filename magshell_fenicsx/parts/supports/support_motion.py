@@ -115,11 +115,9 @@ def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collect
         Names of those of them at which a live pressure has no potential; with any, there is no
         volume.
     """
-    return (
-        bool(loads.moves)
-        and not without_potential
-        and all(motions_of(loads, name) for name in free_edges)
-    )
+    if not loads.moves or without_potential:
+        return False
+    return all(motions_of(loads, name) for name in free_edges)
 
 
 def pressed_edges(
@@ -153,7 +151,7 @@ def pressed_edges(
     for name in curves:
         if motions := motions_of(loads, name):
             motion_key = tuple(
-                (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
+                (m.name, m.shift.tobytes(), m.turn.tobytes(), m.centre.tobytes()) for m in motions
             )
             edges_by_motion.setdefault(motion_key, []).append(name)
     # the corners of cells on planes of symmetry, of all ranks

@@ -412,22 +412,19 @@ class History:
         # beyond the hand-over meshes of the first model have no state to compare
         if self.handed_over:
             return _instability(self._departures(scene)[0])
-        if (
-            until in ("target", "points", "zero")
-            and not stopped
-            and self.last
-            and self.last.amplitude not in ("", "time")  # "": no load; "time": a motion
-        ):
-            return at_target(scene, self.last)
         if self.last and self.last.amplitude == "time":
             raise NoResult("a motion ends at no single load")
+        ends_at_target = until in ("target", "points", "zero") and not stopped
+        loaded_record = self.last if self.last and self.last.amplitude else None
+        if loaded_record and ends_at_target:
+            return at_target(scene, loaded_record)
         if not self.located:
             no_instability = (
                 "there is no instability up to the target"
                 if steps and steps[-1].load.limit_target
-                else ""
+                else "the case has neither a load nor a field"
             )
-            raise NoResult(stopped or no_instability or "the case has neither a load nor a field")
+            raise NoResult(stopped or no_instability)
         located_in_last_step = [
             record for record in self.located if record.step == self.located[-1].step
         ]

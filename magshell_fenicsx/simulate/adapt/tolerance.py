@@ -518,8 +518,8 @@ def _remeshed(
     (scene, _), degree = coarse_solution, choice.degree
     order = 2 * degree - 2  # of convergence of an energy
     problem = scene.problem
-    is_uniform = problem.axisymmetric or problem.mesh_file or isinstance(problem.shape, Grid)
-    if is_uniform:
+    is_file_or_grid = problem.mesh_file or isinstance(problem.shape, Grid)
+    if problem.axisymmetric or is_file_or_grid:
         refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:  # at least one more line of a grid
             refinement_factor = max(refinement_factor, LINES)

@@ -324,13 +324,15 @@ def variation(
         for term in terms:
             term.add_residual(by_u, factor_of(term.amplitude, mu))
         value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
-        by_mu = {
-            name: sum((c * term.energy() for term, c in weighted_terms), 0.0)
-            for name, weighted_terms in rates.items()
-        }
+        by_mu = {name: _weighted_energy(weighted_terms) for name, weighted_terms in rates.items()}
         return Functional(value, system.zero_at_supports(by_u), by_mu)
 
     return system.at_state(state).evaluate(functional_here)
+
+
+def _weighted_energy(weighted_terms: Iterable[tuple[FormTerm, float]]) -> float:
+    """Return the sum of energies times factors at the present displacement."""
+    return sum((c * term.energy() for term, c in weighted_terms), 0.0)
 
 
 def by_amplitude(

@@ -50,6 +50,7 @@ from magshell_fenicsx.models.shell.spatial_fields import PlacementField, Uniform
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState, energies_along
 from magshell_fenicsx.simulate.gradients.shape import (
     fields_of_placement,
@@ -147,9 +148,9 @@ def _refuse_without_derivative(adjoint: Adjoint, name: str) -> None:
             f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
             "magnitude"
         )
-    if name == "deviation" and (
-        scene.model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
-    ):
+    if name != "deviation":
+        return
+    if scene.model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None):
         raise CaseError(
             "deviation: no gradient beside bodies, or in a field that is known at points of space"
         )
@@ -234,9 +235,10 @@ def _field_at_place(
         if (field_and_gradient := _known_gradient(term, place, w, coefficient))
     ]
     f = f or next((known_field for known_field, _ in known_gradients), None)
-    if f is None and slope and slope.field is not None and coefficient == slope.field.name:
-        f = slope.field
-    if f is None or (not model.thin and coefficient != "Br"):
+    field_in_result, gradients_of_result = _dependence_of_result(slope, coefficient)
+    f = field_in_result if f is None else f
+    has_other_field = not model.thin and coefficient != "Br"  # a solid has the remanence alone
+    if f is None or has_other_field:
         raise CaseError(f"{name}: the case has no such field: no result depends on it")
     # gradients of terms with derivatives of their own, then of forms
     gradients = [gradient_at_points for _, gradient_at_points in known_gradients]
@@ -245,8 +247,8 @@ def _field_at_place(
     else:
         gradients.append(derivatives_by_field(shares, f, model.u, w, model.kernels))
     # J itself, as what a sensor reads, counts once: at the first place
-    if slope and slope.by_field is not None and slope.field is not None and not number:
-        gradients += [slope.by_field] if coefficient == slope.field.name else []
+    if not number:
+        gradients += gradients_of_result
     if name == "thickness" and scene.problem.loads.contacts:
         gradients.append(_by_start_of_bodies(scene, shares, f, w))
     return f, gradients
@@ -558,6 +560,20 @@ def _direction_of_residuals(scene: Scene, place: AdjointState) -> fem.Function:
     return direction
 
 
+def _dependence_of_result(
+    slope: Slope | None, coefficient: str
+) -> tuple[fem.Function | None, list[Array]]:
+    """Return the coefficient of this name in the result itself, and the gradient by it.
+
+    They are None and an empty list if the result does not have it.
+    """
+    if not slope or slope.field is None:
+        return None, []
+    if coefficient != slope.field.name:
+        return None, []
+    return slope.field, [] if slope.by_field is None else [slope.by_field]
+
+
 def _with_field(adjoint: Adjoint, name: str) -> Scene:
     """Return the scene, or one whose terms have a field in place of a uniform number; collective.
 
@@ -570,7 +586,8 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
     if name == "thickness" and not scene.model.thickness:
         return Scene(replace(problem, thickness=Thickness()), scene.comm)
     loads, natural = problem.loads, problem.loads.natural
-    if name == "curvature" and (natural is None or natural.curvature is None):
+    has_no_curvature = natural is None or natural.curvature is None
+    if name == "curvature" and has_no_curvature:
         with_curvature = Natural(
             np.zeros(3),  # the curvatures kappa_11, kappa_22, kappa_12
             natural.stretch if natural else None,
@@ -578,17 +595,13 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         )
         return Scene(replace(problem, loads=replace(loads, natural=with_curvature)), scene.comm)
     magnetic = loads.magnetic
-    if (  # without directions `_terms` takes magnetic terms with the field
-        adjoint.directions
-        and FIELDS[name].coefficient == "Br"
-        and magnetic
-        and not callable(magnetic.remanent)
-    ):
-        with_uniform_field = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
-        return Scene(
-            replace(problem, loads=replace(loads, magnetic=with_uniform_field)), scene.comm
-        )
-    return scene
+    # without directions `_terms` takes magnetic terms with the field
+    if not adjoint.directions or FIELDS[name].coefficient != "Br":
+        return scene
+    if not magnetic or callable(magnetic.remanent):
+        return scene
+    with_uniform_field = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+    return Scene(replace(problem, loads=replace(loads, magnetic=with_uniform_field)), scene.comm)
 
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
@@ -602,8 +615,9 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
         for term in scene.model.system.terms
     )
     terms: list[Term] = [term for terms_of_part in forms_of_terms for term in terms_of_part]
-    magnetic = scene.model.loads.magnetic
-    if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
+    is_by_remanence = FIELDS[name].coefficient == "Br"
+    magnetic = scene.model.loads.magnetic if is_by_remanence else None
+    if magnetic and not callable(magnetic.remanent):
         terms = list(
             magnetic_terms(
                 scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))

@@ -121,13 +121,11 @@ def _refuse_shell_number(adjoint: Adjoint, key: str) -> None:
     CaseError
         If it changes the law of a gas, or the first contact with a body, on which J depends.
     """
-    if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
+    if not key.startswith("shell."):
+        return
+    if adjoint.gas or any(place.gas for place in adjoint.places):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
-    if (
-        adjoint.scene.model.contacts
-        and any(place.follows for place in adjoint.places)
-        and key.startswith("shell.")
-    ):
+    if adjoint.scene.model.contacts and any(place.follows for place in adjoint.places):
         raise CaseError(
             f"{key}: has no derivative where a conjugate is held beside a body: the first contact "
             "shifts it"
@@ -346,12 +344,13 @@ def gradient(
     FoldLost
         If Newton's method for the fold fails.
     """
-    if isinstance(of, str) and of in FOLDS and record.amplitude != FOLDS[of]:
+    fold_amplitude = FOLDS.get(of) if isinstance(of, str) else None
+    if fold_amplitude and record.amplitude != fold_amplitude:
         raise CaseError(
-            f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}"
+            f"{of}: the record is of {record.amplitude or 'the start'}, not of {fold_amplitude}"
         )
     begins = {record.step: begin} if begin else {}  # of this step alone
-    if of == "instability" or (isinstance(of, str) and of in FOLDS):
+    if of == "instability" or fold_amplitude:
         adjoint = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
     else:
         history = History(last=record, end=record, begin=begin, begins=begins)

@@ -47,12 +47,14 @@ def located(records: Sequence[Record], amplitude: str) -> list[Record]:
     records_in_amplitude = [
         record for record in records if record.amplitude == amplitude and not record.branch
     ]
-    return [
-        record
-        for record in records_in_amplitude
-        if record.label == "fold"
-        or (record.label == "bifurcation" and not record.point.negative_pivots)
-    ]
+    return [record for record in records_in_amplitude if _loses_stability(record)]
+
+
+def _loses_stability(record: Record) -> bool:
+    """Return whether a record is a fold, or a bifurcation of what was stable before."""
+    if record.label == "bifurcation":
+        return not record.point.negative_pivots
+    return record.label == "fold"
 
 
 def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
@@ -60,7 +62,8 @@ def on_path(scene: Scene, records: Sequence[Record]) -> list[Record]:
     before_branch, steps = list[Record](), scene.problem.programme
     for record in records:
         before_branch.append(record)
-        if record.label == "bifurcation" and record.step and leaves_path(steps[record.step - 1]):
+        is_bifurcation_in_step = record.label == "bifurcation" and record.step
+        if is_bifurcation_in_step and leaves_path(steps[record.step - 1]):
             break
     return before_branch
 
@@ -79,10 +82,11 @@ def refuse_unitless(scene: Scene, result: str) -> None:
         If the result has a unit, and the case does not have this unit.
     """
     sizes = scene.sizes
+    if result not in SCALES:
+        return
     # a field in T is no result in mT
-    if result in SCALES and (
-        SCALES[result] not in sizes.by_unit or (result.endswith("_mT") and sizes.field != "mT")
-    ):
+    has_other_unit = result.endswith("_mT") and sizes.field != "mT"
+    if SCALES[result] not in sizes.by_unit or has_other_unit:
         name_without_unit = next(
             name for name, amplitude in FOLDS.items() if amplitude == FOLDS[result]
         )

@@ -193,7 +193,7 @@ def refuse_no_result(
                 refuse_no_barrier(scene.problem)
             elif NAMES.fullmatch(result):
                 refuse_no_vibration(scene.problem, result)
-            elif result not in FOLDS and result not in columns and result not in start.mu:
+            elif not any(result in names for names in (FOLDS, columns, start.mu)):
                 allowed = ", ".join((*FOLDS, *columns, BARRIER, *FIRST_FREQUENCIES, *extra_results))
                 raise CaseError(f"{result}: has no gradient here; allowed are {allowed}")
         except CaseError as e:

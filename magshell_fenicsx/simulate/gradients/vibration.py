@@ -200,9 +200,11 @@ def _groups(modes: Sequence[ShellMode]) -> list[Vibration]:
             matching_groups[-1].append(i)
         else:
             groups.append([i])
-    return [
-        Vibration(tuple(modes[i] for i in group), tuple(i + 1 for i in group)) for group in groups
-    ]
+    vibrations = list[Vibration]()
+    for group in groups:
+        modes_of_group = tuple(modes[i] for i in group)
+        vibrations.append(Vibration(modes_of_group, tuple(i + 1 for i in group)))
+    return vibrations
 
 
 def _is_degenerate(a: ShellMode, b: ShellMode) -> bool:
@@ -325,7 +327,7 @@ def _adjoint(
             for mode in vibration.modes
         ]
     by_u = np.sum([slope.by_u for slope in slopes], axis=0) * factor
-    by_mu = {name: factor * sum(slope.by_mu[name] for slope in slopes) for name in held_conjugates}
+    by_mu = {name: factor * _total_rate(slopes, name) for name in held_conjugates}
     # without loads, as where rigid motions are allowed, p does not displace the shell: w is zero
     w, rows = (
         (0.0 * by_u, {})
@@ -388,6 +390,11 @@ def _wave_number(mode: ShellMode) -> int | None:
     if mode.label == TORSION:
         return 0
     return int(mode.label.removeprefix(WAVE)) if mode.label.startswith(WAVE) else None
+
+
+def _total_rate(slopes: Iterable[Functional], name: str) -> float:
+    """Return the sum of the derivatives of functionals by an amplitude."""
+    return sum(slope.by_mu[name] for slope in slopes)
 
 
 def _slopes(

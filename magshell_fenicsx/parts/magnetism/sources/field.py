@@ -101,7 +101,7 @@ def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
     model's frame about e3 in radians.
     """
     applied = _applied(context)
-    if applied is None or not (applied.components or applied.sources or applied.gradient):
+    if applied is None or applied.is_uniform:
         return ()
     # each step turns the field's axis from where the last one left it, by the shortest way
     rotations, start, zero = list[RigidMotion](), applied.vector(turn), np.zeros(3)

@@ -81,7 +81,7 @@ class GridSection(FileKeys, SourceSection):
                 H[:, :, k, j] = second_derivative
             return B, G, H
 
-        low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+        low, high = np.array([axis[0] for axis in axes]), np.array([axis[-1] for axis in axes])
         # beyond the grid the spline is nan
         return FieldOfSource(values, box_lines(low, high), "beyond the grid of")
 
@@ -162,7 +162,8 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
         )
     axes = [columns[name] for name in PLACES]
     # .npz arrays may hold the places along each axis alone, and B on the whole grid
-    on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
+    has_whole_grid = file.suffix == ".npz" and columns["Bx"].ndim == 3
+    on_axes = has_whole_grid and {a.ndim for a in axes} == {1}
     if on_axes and columns["Bx"].size == prod(a.size for a in axes):
         columns |= dict(zip(PLACES, np.meshgrid(*axes, indexing="ij"), strict=True))
     rows = [columns[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]
