@@ -38,7 +38,7 @@ OUTCOME = Outcome.failed("lost", 1.5, 3)
 
 
 def test_no_study_knows_the_case_file() -> None:
-    """Studies stand below the room of the case: they get what makes a case of its source."""
+    """Studies stand below the package of the case: they get what makes a case of its source."""
     package = Path(magshell_fenicsx.__file__).parent
     files = [*(package / "studies").glob("*.py"), package / "input" / "chance.py"]
     assert len(files) > 20
