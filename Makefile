@@ -25,7 +25,7 @@ make test             lint and the tests that are not marked slow: 10 minutes on
                       LIMIT=seconds; OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor;
                       ROOT=sid: on Debian unstable, ROOT=pypi: with the packages of PyPI, both without lint)
 make test-all         lint and all tests
-make lint             ruff and mypy
+make lint             ruff, import-linter and mypy
 make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
 make image            the Docker image magshell_fenicsx
@@ -89,6 +89,7 @@ test-all: lint
 lint:
 	$(ENV) ruff check --exclude .env .
 	$(ENV) ruff format --check --exclude .env .
+	$(ENV) lint-imports --no-logo --no-cache
 	$(ENV) mypy magshell_fenicsx
 
 image:

@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from magshell_fenicsx.platform.packages import load_mpi_first
+from magshell_fenicsx.platform.version import __version__
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
     from magshell_fenicsx.simulate.trace import trace
 
-__version__ = "0.2.0"
 __all__ = [
     "Case",
     "CaseError",

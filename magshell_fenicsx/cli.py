@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Any
 
-from magshell_fenicsx import __version__, inspection
+from magshell_fenicsx import inspection
 from magshell_fenicsx.command import (
     INTERRUPTED,
     INVALID,
@@ -29,6 +29,7 @@ from magshell_fenicsx.command import (
 from magshell_fenicsx.platform.packages import Unusable, install_hint
 from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams
+from magshell_fenicsx.platform.version import __version__
 
 app = Commands(
     help="Thin magnetic shells: deformation, indentation, buckling.",

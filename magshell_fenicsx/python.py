@@ -28,9 +28,9 @@ from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.mesh.user_mesh import MeshPart, UserMesh
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
+from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
-from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str

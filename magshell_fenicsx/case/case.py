@@ -58,6 +58,8 @@ from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.natural.section import NaturalSection
 from magshell_fenicsx.parts.registered import PART_CLASSES, Origin, WithParts
+from magshell_fenicsx.parts.revolution_sections import CapSurface, RevolutionSurface
+from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
@@ -68,8 +70,6 @@ from magshell_fenicsx.problem.requests import (
     StabilitySection,
 )
 from magshell_fenicsx.shape.reference_shell import Coordinates
-from magshell_fenicsx.shape.revolution_sections import CapSurface, RevolutionSurface
-from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.studies.identify_sections import IdentifySection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 

@@ -19,9 +19,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.shells import MemberCase
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
+from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.problem.mesh_sizes import MeshSection
-from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from mpi4py import MPI

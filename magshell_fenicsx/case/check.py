@@ -15,13 +15,13 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
+from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.problem.formulas import case_formulas, cells_of_patch, unresolved_formulas
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.mesh_sizes import degree_of
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.problem.surface_names import open_edges
-from magshell_fenicsx.shape.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.simulate.overlap import refuse_overlap
 
 

@@ -19,9 +19,10 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.mesh.multi_shell import MEETING_TOLERANCE, ShellPose
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, MeshError
+from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.shape.meridian_chart import MeridianChart, ShellMeridian
-from magshell_fenicsx.shape.outline import Outline, reference_shell_of
+from magshell_fenicsx.shape.outline import Outline
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.shells import MemberCase, SeveralShells

@@ -15,9 +15,9 @@ from pydantic import Discriminator, Field, Tag
 from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.registered import FORMER_KINDS, KINDS_BEFORE_LOAD, STEPS
+from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import Gas
-from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 if TYPE_CHECKING:
     OneStep: TypeAlias = Step

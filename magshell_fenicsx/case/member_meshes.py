@@ -27,9 +27,9 @@ from magshell_fenicsx.mesh.mirror import (
     rotation,
 )
 from magshell_fenicsx.mesh.multi_shell import MemberShell, MultiShellMesh
-from magshell_fenicsx.shape.outline import reference_shell_of
+from magshell_fenicsx.parts.shell_outline import reference_shell_of
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import Vectors
 
 if TYPE_CHECKING:

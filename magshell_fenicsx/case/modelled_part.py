@@ -22,9 +22,10 @@ from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.parts.imperfections.imperfection import imperfection_geometries
 from magshell_fenicsx.parts.imperfections.symmetry import imperfection_constraints
 from magshell_fenicsx.parts.laminate import ShellLaminate
+from magshell_fenicsx.parts.shell_outline import reference_shell_of
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
-from magshell_fenicsx.shape.outline import Outline, reference_shell_of
-from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry_constraint import (
     SymmetryConstraint,
     common_mirror,
@@ -127,8 +128,8 @@ def symmetry_constraints(
 
     The parts are the shape, abilities, load steps, named points and `energies`.
     """
-    context = case.context
-    constraints = [shape_constraint(case.shell, outline)]
+    context, shell = case.context, case.shell
+    constraints = [shape_constraint(shell.geometry, shell.thickness_factor, outline)]
     for section in context.abilities:
         constraints += section.symmetry_constraints(context, outline)
     for step in case.programme:
@@ -158,7 +159,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     # if patches have names, each imperfection must be its own image, not that of another
     one_by_one = bool(case.patches)
     constraints = [
-        shape_constraint(case.shell, perfect),
+        shape_constraint(case.shell.geometry, case.shell.thickness_factor, perfect),
         *imperfection_constraints(imperfections, perfect, one_by_one=one_by_one),
     ]
     if plies := ShellLaminate.from_context(case.context):

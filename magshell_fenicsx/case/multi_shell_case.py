@@ -19,7 +19,7 @@ from magshell_fenicsx.case.shells import MemberCase, OneOfShells, SeveralShells,
 from magshell_fenicsx.input.section import Section, numbers_with_units
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
-from magshell_fenicsx.shape.shell_sections import ShellSection
+from magshell_fenicsx.parts.shell_sections import ShellSection
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case

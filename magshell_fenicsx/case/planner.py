@@ -65,6 +65,8 @@ from magshell_fenicsx.parts.imperfections.symmetry import (
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.registered import STEPS
+from magshell_fenicsx.parts.shell_outline import reference_shell_of
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
@@ -81,9 +83,8 @@ from magshell_fenicsx.problem.mesh_sizes import Loaded, Refined, grading
 from magshell_fenicsx.problem.model_description import describe_model
 from magshell_fenicsx.problem.problem import Document, PendingModes, Problem, solid_body_of
 from magshell_fenicsx.problem.surface_names import refuse_unfit_ends, surface_terms
-from magshell_fenicsx.shape.outline import Chart, Outline, reference_shell_of
+from magshell_fenicsx.shape.outline import Chart, Outline
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, why_not_axisymmetric
 
 Array = NDArray[np.float64]

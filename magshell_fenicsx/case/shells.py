@@ -24,9 +24,9 @@ from magshell_fenicsx.mesh.multi_shell import MultiShellMesh, ShellPose
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
+from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.reference_shell import Coordinates
-from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case

@@ -26,9 +26,9 @@ from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import Deviation
     from magshell_fenicsx.models.shell.spatial_fields import InsideRim
+    from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline
-    from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 Array = NDArray[np.float64]
 Kind = TypeVar("Kind")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State, Vector
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.shells.model_base import ModelBase
+    from magshell_fenicsx.parts.observed_model import ObservedModel
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class ModelView:
         Sign of the case's field.
     """
 
-    model: "ModelBase"
+    model: "ObservedModel"
     length: float
     modulus: float
     mirror: Mirror | None

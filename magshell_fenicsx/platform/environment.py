@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx import __version__
+from magshell_fenicsx.platform.version import __version__
 
 OPTIMISED_BLAS = re.compile(
     r"/lib(openblas|mkl_rt|mkl_core|blis|flexiblas|armpl)[^/]*$", re.MULTILINE

@@ -10,10 +10,10 @@ from math import log
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.platform.environment import available_memory
 from magshell_fenicsx.problem.mesh_sizes import degree_of
 from magshell_fenicsx.problem.problem import Problem, layer_bounds
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 BYTES_PER_PROCESS = 0.25e9  # before its model
 # degree -> bytes over N ln N of N unknowns, of full shells

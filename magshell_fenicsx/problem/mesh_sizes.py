@@ -20,10 +20,10 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFeature
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.supports.boundary import RUBBER_EDGE_SIZE, BoundarySection
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline

@@ -15,8 +15,8 @@ from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.registered import PART_CLASSES, accounts, parts_of
 from magshell_fenicsx.parts.rubber import law_account, laws_of
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import SolidBody, solid_body_of
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 MAX_LISTED_IMPERFECTIONS = 6  # of more only the kinds are told
 

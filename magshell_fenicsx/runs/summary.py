@@ -24,10 +24,10 @@ from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
-from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.record import Record

@@ -1,8 +1,7 @@
 """The surface of a shell as a chart and its map to space, over the reference length R.
 
-An `Outline` says what is meshed, how it is put into space, and which symmetry the surface has.
-`outline` makes the outline of any geometry. `reference_shell_of` makes what imperfections, bodies
-and sources need to know of a shell.
+An `Outline` says what is meshed, how it is put into space, and which symmetry the surface has. Each
+kind of surface has a function that makes its outline, of plain numbers and profiles.
 
 A chart is a plane domain that is meshed: a disc around a pole, a strip, or a rectangle (`Grid`).
 "The chart of a place" is its coordinates (2,) there. A mesh file has no chart: nodes in space stand
@@ -16,7 +15,7 @@ tested.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from math import inf, pi, radians
+from math import inf, pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,18 +48,6 @@ from magshell_fenicsx.mesh.surfaces_of_revolution import (
 )
 from magshell_fenicsx.shape.meridian_chart import MeridianChart
 from magshell_fenicsx.shape.mirrors import grid_mirrors, mesh_mirrors, mirror_lines
-from magshell_fenicsx.shape.reference_shell import ReferenceShell
-from magshell_fenicsx.shape.revolution_sections import (
-    CapSurface,
-    RevolutionSurface,
-    RoundSection,
-)
-from magshell_fenicsx.shape.shell_sections import (
-    MeshSurface,
-    PlateSurface,
-    ShellSection,
-    Surface,
-)
 
 Array = NDArray[np.float64]
 Chart = PlaneShape | Grid | MeshFile  # what is meshed
@@ -266,57 +253,7 @@ class Outline:
         return self.edge < inf
 
 
-def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
-    """Return the reference shell of a case's shell, without imperfections.
-
-    Imperfections, bodies and sources are placed on it.
-    """
-    perfect = outline(shell)
-    factor = shell.thickness_factor
-    azimuth = getattr(shell, "azimuth", None)
-    return ReferenceShell(
-        geometry=shell.geometry,
-        perfect=perfect,
-        imperfect=perfect,
-        R=shell.reference,
-        R_over_h=shell.R_over_h,
-        nu=shell.poisson_ratio,
-        with_units=shell.with_units,
-        edge_polar=shell.edge_polar,
-        # only a formula is known at any place
-        thickness_factor=factor if isinstance(factor, str) else None,
-        # all that the surface depends on, by which it is cached
-        identity=(
-            shell.model_dump_json(exclude={"imperfections"}),
-            shell.digest if isinstance(shell, MeshSurface) else None,
-        ),
-        hole_polar=getattr(shell, "hole", None) or 0.0,
-        azimuths=(azimuth[0], azimuth[1]) if azimuth else None,
-    )
-
-
-def outline(shell: Surface | ShellSection) -> Outline:
-    """Return the outline of a shell without imperfections, by its geometry."""
-    if isinstance(shell, MeshSurface):
-        return _mesh_outline(shell)
-    if isinstance(shell, ShellSection) and shell.width is not None:
-        return _strip_outline(shell.width)
-    if isinstance(shell, ShellSection) and shell.geometry == "disc":
-        return _disc_outline(1.0, "rim", plane_embedding, plane_normals, _plane_chart)
-    if isinstance(shell, ShellSection):
-        return _sphere_outline(pi / 2, "equator")
-    if isinstance(shell, CapSurface) and shell.hole is None:
-        return _sphere_outline(radians(shell.polar), "rim")
-    if isinstance(shell, PlateSurface):
-        return _plate_outline(shell.width / shell.reference)
-    # a surface of revolution; a profile that ends at a pole has None for the name of this end
-    profile, (first_name, last_name) = shell.profile_and_edges
-    if last_name is None:
-        return _capped_outline(profile, first_name)
-    return _ring_outline(shell, profile, (first_name, last_name))
-
-
-def _plate_outline(width: float) -> Outline:
+def plate_outline(width: float) -> Outline:
     """Return the outline of a rectangle of length one; `width` is over the length."""
     high = np.array([1.0, width])
     grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
@@ -325,7 +262,7 @@ def _plate_outline(width: float) -> Outline:
     )
 
 
-def _capped_outline(profile: Profile, edge_name: str) -> Outline:
+def capped_outline(profile: Profile, edge_name: str) -> Outline:
     """Return the outline of a surface of revolution whose profile ends at a pole."""
     embedding = CappedEmbedding(profile)
     perfect = _disc_outline(
@@ -339,13 +276,15 @@ def _capped_outline(profile: Profile, edge_name: str) -> Outline:
     return replace(perfect, from_pole=embedding.from_pole)
 
 
-def _mesh_outline(shell: MeshSurface) -> Outline:
+def flat_disc_outline() -> Outline:
+    """Return the outline of a flat disc of radius 1 with its edge, the rim."""
+    return _disc_outline(1.0, "rim", plane_embedding, plane_normals, _plane_chart)
+
+
+def mesh_outline(file: MeshFile) -> Outline:
     """Return the outline of a mesh file, of a program's triangles, or of several shells."""
-    scale = (shell.unit or 1.0) / shell.reference  # of the file's lengths over R
-    in_memory = shell.files.given.get(shell.path)
-    file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, in_memory)
-    if isinstance(in_memory, MultiShellMesh):
-        return _multi_shell_outline(file, in_memory)
+    if isinstance(file.in_memory, MultiShellMesh):
+        return _multi_shell_outline(file, file.in_memory)
 
     def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
         """Return the planes that map the triangles onto themselves, each with either half.
@@ -397,7 +336,7 @@ def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
     )
 
 
-def _strip_outline(width: float) -> Outline:
+def strip_outline(width: float) -> Outline:
     """Return the outline of a flat strip of length 1 along e1; `width` is over the length."""
     tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
 
@@ -416,7 +355,7 @@ def _strip_outline(width: float) -> Outline:
     )
 
 
-def _sphere_outline(edge: float, edge_name: str) -> Outline:
+def sphere_outline(edge: float, edge_name: str) -> Outline:
     """Return the outline of a part of the unit sphere about e3, with its pole.
 
     `edge` is the polar angle of its edge in radians.
@@ -488,8 +427,11 @@ def _disc_outline(
     )
 
 
-def _ring_outline(
-    shell: RoundSection | RevolutionSurface, profile: Profile, names: tuple[str, str]
+def ring_outline(
+    profile: Profile,
+    names: tuple[str, str],
+    azimuths: tuple[float, float],
+    closed: tuple[bool, bool],
 ) -> Outline:
     """Return the outline of a surface of revolution without a pole, or of a part of one.
 
@@ -501,12 +443,14 @@ def _ring_outline(
         Curve (rho, z) over R that is turned about e3.
     names
         Names of the edges where the profile begins and ends.
+    azimuths
+        First and last azimuth (rad).
+    closed
+        Whether the surface is closed around e3, and the profile ends where it begins.
     """
-    first, last = shell.azimuth_range  # radians
+    first, last = azimuths
     s = np.linspace(0, profile.length, PROFILE_SAMPLES, dtype=np.float64)
     rho = float(profile(s)[:, 0].max())
-    # whether the grid is closed: around e3, and along the profile
-    glued = shell.azimuth is None, shell.closed
     low, high = (first * rho, 0.0), (last * rho, profile.length)
     embedding = RevolvedEmbedding(profile, rho)
 
@@ -528,7 +472,7 @@ def _ring_outline(
 
     # only a surface closed around e3, with edges, has a meridian
     meridian = None
-    if glued == (True, False):
+    if closed == (True, False):
         meridian = MeridianChart(
             length=profile.length,
             curvature_jumps=(),
@@ -539,9 +483,9 @@ def _ring_outline(
             curvature=_largest_curvature(profile),
         )
     # the element size of 1 is replaced when the grid is meshed
-    grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
+    grid = Grid(low, high, 1.0, ("left", "right", *names), closed)
     # the reported point is a corner of the chart: the first one if two sides are one line in space
-    highest = np.array(low if any(glued) else high)
+    highest = np.array(low if any(closed) else high)
     return _grid_outline(grid, embedding, embedding.normal, inverse, highest, meridian)
 
 

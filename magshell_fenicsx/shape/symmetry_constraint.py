@@ -11,7 +11,7 @@ symmetry planes; it is round if it is closed around e3. A round surface has all 
 so that vectors and azimuths of the parts choose some as candidates.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import atan2, cos, hypot, pi, sin
 from typing import TYPE_CHECKING
@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, Sector
+from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 
 if TYPE_CHECKING:  # outlines read meshes, which needs the solver
     from magshell_fenicsx.shape.outline import Outline
-    from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]
@@ -225,12 +225,20 @@ def unit(v: Array) -> Array:
     return np.asarray(scaled / np.linalg.norm(scaled))
 
 
-def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> SymmetryConstraint:
+def shape_constraint(
+    geometry: str, factor: str | Mapping[str, float] | UserField | None, outline: "Outline"
+) -> SymmetryConstraint:
     """Return the symmetry that the mid-surface and its thickness preserve.
 
     Its mirrors test the thickness alone; planes of the surface come from the outline.
+
+    Parameters
+    ----------
+    geometry
+        The kind of surface in the user's words, such as "torus".
+    factor
+        Multiplies the thickness: a formula, numbers by the names of patches, or a field; None: 1.
     """
-    factor, geometry = shell.thickness_factor, shell.geometry
 
     def mirrors(mirror: Mirror) -> bool:
         if not isinstance(factor, str):
@@ -250,15 +258,14 @@ def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> Sym
 
 
 def patch_constraint(
-    key: str, names: Iterable[str], shell: "ShellSection | Surface"
+    key: str, names: Iterable[str], assembly: MultiShellMesh | None
 ) -> SymmetryConstraint:
     """Return the constraint of patches that a key names.
 
     Where a case has several shells (`assembly`), their meridians know each whole shell by its name,
     but no other patch. So a name that is none of a shell forbids the meridian, also where the
-    surface has no such patch.
+    surface has no such patch. Patches of one shell (None) have no constraint.
     """
-    assembly = getattr(shell, "assembly", None)
     patch = None
     if assembly:
         # `laws` has the names of the shells

@@ -50,8 +50,8 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
+from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.outline import reference_shell_of
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
 from magshell_fenicsx.simulate.perturbation import number_at_key, perturbed_scene, scale_at_key
 from magshell_fenicsx.simulate.record import Record

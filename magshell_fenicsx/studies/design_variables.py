@@ -26,9 +26,9 @@ from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
+from magshell_fenicsx.parts.shell_outline import outline
 from magshell_fenicsx.problem.formulas import THICKNESS
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.perturbation import number_at_key
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design_blocks import (

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.contact_mesh_size import CONTACT_CELL_SIZE, ChartedShell, contact_places
 from magshell_fenicsx.case.member_meshes import MemberMeshes
-from magshell_fenicsx.shape.outline import outline
+from magshell_fenicsx.parts.shell_outline import outline
 
 Array = NDArray[np.float64]
 h = 0.02

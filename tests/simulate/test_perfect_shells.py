@@ -15,8 +15,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.imperfection import imperfection_geometries
 from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
+from magshell_fenicsx.parts.shell_outline import outline, reference_shell_of
 from magshell_fenicsx.public import Scene, run
-from magshell_fenicsx.shape.outline import outline, reference_shell_of
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
 from magshell_fenicsx.simulate.sensitivity import with_changed_number
 

@@ -38,9 +38,9 @@ OUTCOME = Outcome.failed("lost", 1.5, 3)
 
 
 def test_no_study_knows_the_case_file() -> None:
-    """Studies stand below the room of the case: they get what makes a case of its source."""
-    rooms = Path(magshell_fenicsx.__file__).parent
-    files = [*(rooms / "studies").glob("*.py"), rooms / "input" / "chance.py"]
+    """Studies stand below the package of the case: they get what makes a case of its source."""
+    package = Path(magshell_fenicsx.__file__).parent
+    files = [*(package / "studies").glob("*.py"), package / "input" / "chance.py"]
     assert len(files) > 20
     assert not [
         file.name for file in files if "magshell_fenicsx.case" in file.read_text(encoding="utf-8")

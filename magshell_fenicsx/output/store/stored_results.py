@@ -18,8 +18,8 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
+from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.requests import OutputSection
-from magshell_fenicsx.shape.shell_sections import FLAT_GEOMETRIES
 
 SUMMARY = "summary.json"
 NUMBER_TYPES, NONE_TYPE = (int, float), type(None)

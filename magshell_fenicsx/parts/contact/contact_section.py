@@ -14,7 +14,7 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
-from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
 if TYPE_CHECKING:
@@ -127,7 +127,8 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
         outline is not used here.
         """
         names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
-        return [patch_constraint("contact", names, context.shell)]
+        assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
+        return [patch_constraint("contact", names, assembly)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         """Return `pairs` of the model's `Loads`: the pairs that may touch, dimensionless."""

@@ -30,9 +30,9 @@ from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.parts.ability import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
+from magshell_fenicsx.parts.revolution_sections import SurfaceSection
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.quantities.quantity import CaseSizes
-from magshell_fenicsx.shape.revolution_sections import SurfaceSection
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
@@ -547,7 +547,7 @@ class MagneticSection(Section, Ability):
         from magshell_fenicsx.parts.magnetism.sources.field import (
             placed_sources,
         )  # the solver takes long to import
-        from magshell_fenicsx.shape.outline import outline
+        from magshell_fenicsx.parts.shell_outline import outline
 
         if not (sources := placed_sources(context)):
             return []

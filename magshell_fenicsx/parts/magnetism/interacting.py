@@ -50,7 +50,7 @@ from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 from magshell_fenicsx.parts.observables import ModelView
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.model_base import ModelBase
+    from magshell_fenicsx.parts.observed_model import ObservedModel
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -143,7 +143,7 @@ class InteractionTerm:
 
     group, column = "magnetic", "magnetic"
 
-    def __init__(self, model: "ModelBase", u: fem.Function, interaction: Interaction) -> None:
+    def __init__(self, model: "ObservedModel", u: fem.Function, interaction: Interaction) -> None:
         """Gather the cells of all ranks; charges and derivatives are computed when asked for."""
         self.name = self.amplitude = AMPLITUDE
         self._acts_on_itself = interaction.itself

@@ -16,10 +16,10 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.path_step import FactorStep
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads

@@ -51,6 +51,7 @@ from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.shape.meridian_chart import (
     field_is_axisymmetric,
     scalar_is_axisymmetric,
@@ -59,7 +60,6 @@ from magshell_fenicsx.shape.meridian_chart import (
     with_nearby_places,
 )
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import (
     PARALLEL,
     SymmetryConstraint,

@@ -21,8 +21,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.ability import Context, KeyAbility
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.shape.reference_shell import Coordinates
-from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 Array = NDArray[np.float64]
 # iterations and difference step of Gauss and Newton's method for the nearest place of a surface
@@ -198,7 +198,7 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
     It is negative inside. `x` (3,) is over R. A chart is a place on the surface, in the coordinates
     of its outline.
     """
-    from magshell_fenicsx.shape.outline import outline  # reads meshes
+    from magshell_fenicsx.parts.shell_outline import outline  # reads meshes
 
     outline_of_shell = outline(shell)
     chart, half = np.asarray(outline_of_shell.inverse(x), dtype=float), 0.5 / shell.R_over_h

@@ -21,9 +21,9 @@ from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
+from magshell_fenicsx.parts.shell_sections import MeshSurface, PlateSurface, ShellSection
 from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.shell_sections import MeshSurface, PlateSurface, ShellSection
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 Array = NDArray[np.float64]

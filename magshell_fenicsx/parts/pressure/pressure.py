@@ -19,6 +19,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import PathStep
+from magshell_fenicsx.parts.revolution_sections import CapSurface
+from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import (
     GasSection,
@@ -30,8 +32,6 @@ from magshell_fenicsx.parts.step_course import (
     Until,
 )
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
-from magshell_fenicsx.shape.revolution_sections import CapSurface
-from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
 INFLATION_STEP_FACTOR = 10.0  # of the largest step of blown-up rubber, times E h/R over p_c
@@ -95,9 +95,10 @@ class PressureSection(PathStep):
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that a pressure on some patches preserves."""
+        assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return [
             *super().symmetry_constraints(step, context, outline),
-            patch_constraint(f"{step.key}.on", self.on or (), context.shell),
+            patch_constraint(f"{step.key}.on", self.on or (), assembly),
         ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.parts.ability import Ability, Context, Offer
-from magshell_fenicsx.shape.shell_sections import ShellSection
+from magshell_fenicsx.parts.shell_sections import ShellSection
 from magshell_fenicsx.shape.symmetry_constraint import (
     PARALLEL,
     SymmetryConstraint,

@@ -21,7 +21,7 @@ from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TUR
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
-    from magshell_fenicsx.shells.model_base import ModelBase
+    from magshell_fenicsx.parts.observed_model import ObservedModel
 
 Array = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ class ReactionsObservables(Observables):
 
 
 def observed_reactions(
-    model: "ModelBase",
+    model: "ObservedModel",
     state: "State",
     mirror: Mirror | None,
     frame: Array,

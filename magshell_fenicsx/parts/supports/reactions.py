@@ -20,7 +20,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.supports.support_motion import PRECEDENCE
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.shells.model_base import ModelBase
+    from magshell_fenicsx.parts.observed_model import ObservedModel
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Reaction:
 
 
 def reactions(
-    model: "ModelBase", state: State, mirror: Mirror | None = None
+    model: "ObservedModel", state: State, mirror: Mirror | None = None
 ) -> dict[str, Reaction]:
     """Return the reactions of all supports by name, in the model's frame; collective.
 
@@ -104,7 +104,9 @@ def reactions(
     return _of_whole(by_support, mirror) if mirror else by_support
 
 
-def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | None = None) -> Array:
+def weights(
+    model: "ObservedModel", name: str, direction: Array, mirror: Mirror | None = None
+) -> Array:
     """Return weights e of the residual R, such that e . R is a support's force along a direction.
 
     The force is that on the whole shell, as in `reactions`.
@@ -134,7 +136,7 @@ def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | No
     return np.asarray(_shares(model)[name] * np.tile(components, system.size // axes))
 
 
-def _shares(model: "ModelBase") -> dict[str, Array]:
+def _shares(model: "ObservedModel") -> dict[str, Array]:
     """Return each support's share in the force at each of this rank's unknowns.
 
     A share is between 0 and 1, in an array of this rank's unknowns. A point has the whole force of

@@ -24,8 +24,8 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
+from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.contact_control import stiffened_equilibrium
 from magshell_fenicsx.simulate.gradients.adjoint import (

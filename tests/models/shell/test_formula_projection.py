@@ -16,9 +16,9 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulaGroup, formula
 from magshell_fenicsx.models.shell.formula_projection import project_formula
 from magshell_fenicsx.models.shell.spatial_fields import cell_geometry
+from magshell_fenicsx.parts.shell_outline import outline
 from magshell_fenicsx.problem.formulas import adaptive_cells
 from magshell_fenicsx.public import Scene
-from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.follow import follow
 
 SPHERE = {

@@ -11,7 +11,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.data import _on_quadrics, feet
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
-from magshell_fenicsx.shape.outline import Outline, outline, reference_shell_of
+from magshell_fenicsx.parts.shell_outline import outline, reference_shell_of
+from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(16)

@@ -20,8 +20,8 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
     imperfection_geometries,
 )
 from magshell_fenicsx.parts.imperfections.symmetry import imperfection_constraints
+from magshell_fenicsx.parts.shell_outline import outline, reference_shell_of
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shape.outline import outline, reference_shell_of
 from magshell_fenicsx.shape.reference_shell import AngularDistance
 
 Array = NDArray[np.float64]

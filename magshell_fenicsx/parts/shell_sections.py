@@ -31,7 +31,7 @@ from magshell_fenicsx.input.section import (
 )
 from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
-from magshell_fenicsx.shape.revolution_sections import (
+from magshell_fenicsx.parts.revolution_sections import (
     AnnulusSurface,
     CapSurface,
     CylinderSurface,
