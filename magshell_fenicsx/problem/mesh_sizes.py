@@ -34,7 +34,9 @@ SOLID_DEGREE = 2
 MAX_SIZE = 0.35  # over R, where nothing needs smaller elements
 UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the largest of grids
 MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
-MIN_RUBBER_EDGE_SIZE = 0.014  # over R: at clamped edges of inflated rubber that is very thin
+# of clamped edges of inflated rubber: the least size of elements over R, and h/R below which the
+# layer there counts less than the mesh
+MIN_RUBBER_EDGE_SIZE, THIN_RUBBER = 0.014, 1 / 200
 RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
 EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
 GROWTH = 0.4  # of the size per distance
@@ -199,7 +201,8 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
     """
     h, growth = sizing.h, _growth(context, sizing)
     boundary = context.section_of(BoundarySection)
-    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary else []
+    is_thick = h >= THIN_RUBBER
+    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary and is_thick else []
     rubber_size = max(RUBBER_EDGE_SIZE * h, MIN_RUBBER_EDGE_SIZE)
     if grid := outline.grid:
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement

@@ -35,6 +35,8 @@ from magshell_fenicsx.models.shell.law import Law
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]
+# width of cells, over the thickness, that show the layer in which stretched rubber bends at an edge
+WIDTH_OF_LAYER = 1.5
 FOLD_ANGLE = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 
 
@@ -203,16 +205,20 @@ def clamped(
     jets, covector, law and natural forms of one side only; `width` is that of its cells, `sigma`
     the penalty.
 
-    The penalty has the stiffness of small strains. That of rubber falls with the stretch: an edge
-    that stretched by itself would turn freely.
+    The stiffness of rubber falls with the stretch: an edge that stretched by itself would turn
+    freely. Where cells are so small that they show the layer in which rubber bends, the penalty
+    has the stiffness of small strains. Larger cells would resist the turn as a whole with it.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
     # the jump -[n] . r_nu from the held normal to that of the shell
     held_normal = n0 if turn is None else ufl.dot(turn, n0)
     J = -ufl.dot(held_normal - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M, _ = densities.normal_moment(r0, u, nu1, nu2, law, natural)
-    _, D = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
+    M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
+    if law.linear is not law:
+        _, D_at_small_strains = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
+        shows_layer = ufl.lt(width, WIDTH_OF_LAYER * law.h)
+        D = ufl.conditional(shows_layer, D_at_small_strains, D)
     return edge_density(M, D, J, width, sigma) * stretch
 
 
