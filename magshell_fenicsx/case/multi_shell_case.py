@@ -418,13 +418,12 @@ def _pairs(contact: Any) -> list[list[str]]:
     entries = [
         entry.get("between") if isinstance(entry, dict) else entry for entry in entries_of_contact
     ]
-    return [[*entry] for entry in entries if _is_pair_of_names(entry)]
+    pairs = [[*entry] for entry in entries if isinstance(entry, list | tuple)]
+    return [pair for pair in pairs if _is_pair_of_names(pair)]
 
 
-def _is_pair_of_names(entry: Any) -> bool:
-    """Return whether an entry is a list of two texts."""
-    if not isinstance(entry, list | tuple):
-        return False
+def _is_pair_of_names(entry: list[Any]) -> bool:
+    """Return whether a list has two texts."""
     return len(entry) == 2 and all(isinstance(name, str) for name in entry)
 
 

@@ -345,7 +345,7 @@ def _is_allowed(node: ast.AST, *, is_called: bool) -> bool:
         if name not in FUNCTIONS or node.keywords:
             return False
         # nin: the number of arguments of NumPy's function
-        return len(node.args) == FUNCTIONS[name].nin
+        return bool(len(node.args) == FUNCTIONS[name].nin)
     return isinstance(node, _ALLOWED)
 
 

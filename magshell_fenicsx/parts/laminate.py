@@ -125,8 +125,7 @@ class LaminateSection(Section):
             raise ValueError("plies: their fractions must add up to 1")
         if len(frozenset[bool]().union(*(ply._with_units for ply in self.plies))) > 1:
             raise ValueError("plies: give each of E1, E2, G12 a unit, or none of them")
-        is_vector = self.along is not None and self.along != MERIDIAN
-        if is_vector and not np.any(self.along):
+        if isinstance(self.along, list) and not np.any(self.along):
             raise ValueError("along: a vector of length zero is no direction")
         return self
 

@@ -134,7 +134,10 @@ def pair_derivatives(
 
 def _values_and_rates(places: list[Complex]) -> list[tuple[Array, Array]]:
     """Return the value and the rate along v of each component of complex places."""
-    return [(np.ascontiguousarray(values.real), values.imag / COMPLEX_STEP) for values in places]
+    return [
+        (np.ascontiguousarray(values.real), np.asarray(values.imag / COMPLEX_STEP))
+        for values in places
+    ]
 
 
 def _by_charges(

@@ -633,7 +633,7 @@ def _cells_with_common_corner(corners: Ints) -> list[list[int]]:
 
     `corners` (cells, 3) are the numbers of the cells' corners.
     """
-    corner_numbers: list[list[int]] = corners.tolist()
+    corner_numbers = [list(map(int, corners_of_cell)) for corners_of_cell in corners]
     cells_at_corner: dict[int, list[int]] = {}
     for cell, corners_of_cell in enumerate(corner_numbers):
         for corner in corners_of_cell:

@@ -162,7 +162,7 @@ def pressed_parts(
     def select_pressed(facets: NDArray[np.int32]) -> NDArray[np.int32]:
         # a facet of an edge has one cell
         is_pressed = [bool(sides[links.links(facet)[0]]) for facet in facets]
-        return facets[np.array(is_pressed, dtype=bool)]
+        return np.asarray(facets[np.array(is_pressed, dtype=bool)])
 
     return {name: select_pressed(facets) for name, facets in edges.items()}
 
