@@ -23,7 +23,7 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import SizingContext
-from magshell_fenicsx.parts.supports.boundary import RUBBER_EDGE_SIZE, BoundarySection
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -34,8 +34,10 @@ SOLID_DEGREE = 2
 MAX_SIZE = 0.35  # over R, where nothing needs smaller elements
 UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the largest of grids
 MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
-# of clamped edges of inflated rubber: the least size of elements over R, and h/R below which the
-# layer there counts less than the mesh
+# sides of triangles at clamped edges of inflated rubber, over the thickness; docs/theory.md, Rubber
+RUBBER_EDGE_SIZE, RUBBER_EDGE_SIZE_AT_DEGREE_3 = 1.0, 2.8
+# the least size of these elements over R, and h/R below which the layer there counts less than the
+# mesh
 MIN_RUBBER_EDGE_SIZE, THIN_RUBBER = 0.014, 1 / 200
 RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
 EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
@@ -203,7 +205,8 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
     boundary = context.section_of(BoundarySection)
     is_thick = h >= THIN_RUBBER
     rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary and is_thick else []
-    rubber_size = max(RUBBER_EDGE_SIZE * h, MIN_RUBBER_EDGE_SIZE)
+    size_over_h = RUBBER_EDGE_SIZE if degree_of(context) > 3 else RUBBER_EDGE_SIZE_AT_DEGREE_3
+    rubber_size = max(size_over_h * h, MIN_RUBBER_EDGE_SIZE)
     if grid := outline.grid:
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}

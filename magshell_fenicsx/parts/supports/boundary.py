@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-# over the thickness: sides of triangles at a clamped edge of inflated rubber, and the cell of a
-# meridian there; docs/theory.md, Rubber
-RUBBER_EDGE_SIZE, RUBBER_EDGE_CELL = 1.0, 1.4
+# width of a meridian's cell at a clamped edge of inflated rubber, over the thickness
+RUBBER_EDGE_CELL = 1.4
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
 EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
@@ -101,18 +100,18 @@ class BoundarySection(Section, Ability):
         return [name for name, condition in self.conditions().items() if condition == "clamped"]
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """Return a warning if elements of the wrong size may stand at clamped, inflated rubber.
+        """Return a warning if pressure blows up rubber beside a clamped edge; None if not.
 
-        Those of a mesh file and of a strip are not chosen for it. None if there is nothing to warn
-        of. `places` are not used here.
+        Several shells are not looked at. `places` are not used here.
         """
         edges = self.edges_of_inflated_rubber(context)
-        if not edges or context.shell.geometry not in ("mesh", "strip"):
+        if not edges or getattr(context.shell, "assembly", None) is not None:
             return None
         return (
             f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
-            "is thick: elements along this edge must be as wide, or instabilities may be false; "
-            "hinged is right with any, and a clamped edge raises the fold by less than h/R"
+            "is thick, which no shell theory describes: far beyond the largest pressure, or with "
+            "elements along this edge that are wider, instabilities may be false; hinged is "
+            "right, and a clamped edge raises the fold by less than h/R"
         )
 
     def refuse_unfit(self, context: Context) -> None:
