@@ -45,8 +45,10 @@ def end_near_last_target(
 
     if not difference(current) * difference(s) < 0:
         return s
-    # a little behind the target, but not behind the planned end
+    # a little behind the target, even if that is the current point but for rounding, and not behind
+    # the planned end
     fraction = END_PAST_TARGET * (_zero(difference, current, s) - current) / (s - current)
+    fraction = max(fraction, END_PAST_TARGET - 1)
     return current + min(fraction, 1.0) * (s - current)
 
 
