@@ -15,7 +15,12 @@ from PIL import Image
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
-from magshell_fenicsx.output.pictures.curve_additions import _free_corner, add_shapes, runs_figure
+from magshell_fenicsx.output.pictures.curve_additions import (
+    _cropped,
+    _free_corner,
+    add_shapes,
+    runs_figure,
+)
 from magshell_fenicsx.output.pictures.lines import curve_steps
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.pictures.plot import (
@@ -29,6 +34,12 @@ from magshell_fenicsx.output.pictures.plot import (
 from magshell_fenicsx.output.pictures.readings import readings_figure
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.problem.requests import OutputSection
+
+
+def test_a_picture_without_its_margins() -> None:
+    image = np.zeros((10, 12, 4))
+    image[3:6, 2:9, 3] = 255  # drawn: rows 3 to 5, columns 2 to 8
+    assert _cropped(image)[..., 3] == pytest.approx(np.full((3, 7), 255))
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import basix
 import numpy as np
@@ -21,6 +22,7 @@ from mpi4py import MPI
 from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene, run
+from magshell_fenicsx.simulate.adapt import tolerance
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, equidistributed
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
@@ -69,6 +71,35 @@ def check(case: Case, reference: float, mesh: Adapted | None = None) -> None:
         < tolerance
     )
     assert error < max(mesh.best.estimate, 1e-8)
+
+
+def test_errors_of_a_solid_that_fall_with_the_square_of_the_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A result with such errors alone: both are found exactly, over the better result."""
+    by_size, by_layers, refinement, layers = 0.3, 0.2, 1.5, 2
+
+    def result(refinement: float, layers: int) -> float:
+        return 1 + by_size / refinement**2 + by_layers / layers**2
+
+    def ending(choice: Choice) -> SimpleNamespace:
+        return SimpleNamespace(value=result(choice.refinement, choice.layers))
+
+    def scene(choice: Choice, *_: object) -> SimpleNamespace:
+        system = SimpleNamespace(dofs=1)
+        return SimpleNamespace(
+            cells=1,
+            model=SimpleNamespace(system=system),
+            refinement=choice.refinement,
+            layers=choice.layers,
+        )
+
+    monkeypatch.setattr(Choice, "scene", scene)
+    monkeypatch.setattr(tolerance, "by_path", ending)
+    _, size_error, thickness_error = tolerance._round(None, COMM, refinement, layers)
+    scale = result(tolerance.FINER * refinement, layers)
+    assert size_error == pytest.approx(by_size / refinement**2 / scale)
+    assert thickness_error == pytest.approx(by_layers / layers**2 / scale)
 
 
 @cache

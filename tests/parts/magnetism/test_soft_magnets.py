@@ -3,10 +3,12 @@ what is refused.
 """
 
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import ufl
 from conftest import CASES
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
@@ -14,6 +16,7 @@ from scipy.optimize import brentq
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.magnetism.soft_magnet import Sheet
 from magshell_fenicsx.public import follow, run
 
 PLATE = {
@@ -45,6 +48,21 @@ TURNED += [{"kind": "rotation", "to": {"polar": 120, "azimuth": 140}}]
 FIELD = {"polar": 30, "flux_density": "200 mT"}
 REMANENT = {"polar": 70, "azimuth": 20, "flux_density": "90 mT"}
 G = {**FIELD, "gradient": [[0.3, 0.1, 0], [0.1, -0.7, 0.2], [0, 0.2, 0.4]]}
+
+
+def test_fields_at_a_displacement_and_at_rest() -> None:
+    """They are B + G x in a field with a gradient, at the place x0 + u and at x0."""
+    field = SimpleNamespace(in_space=False, gradient=True)
+    magnet = SimpleNamespace(amplitudes=["lambda_m"], field=field)
+    B, G = np.array([0.1, -0.2, 0.3]), np.array([[0.3, 0.1, 0], [0.1, -0.7, 0.2], [0, 0.2, 0.4]])
+    x0, u, load = np.array([1.0, 0.5, -0.3]), np.array([0.2, -0.1, 0.4]), 2.0
+    given = [load, ufl.as_vector(list(B)), ufl.as_tensor(G.tolist())]
+    displaced, at_rest = Sheet.fields(
+        magnet, ufl.as_vector(list(x0)), ufl.as_vector(list(u)), given
+    )
+    for vector, place in ((displaced, x0 + u), (at_rest, x0)):
+        values = [vector[i](()) for i in range(3)]
+        assert values == pytest.approx(load * (B + G @ place))
 
 
 def made(
