@@ -89,8 +89,8 @@ test-all: lint
 lint:
 	$(ENV) ruff check --exclude .env .
 	$(ENV) ruff format --check --exclude .env .
-	$(ENV) lint-imports --no-logo --no-cache
 	$(ENV) mypy magshell_fenicsx
+	$(ENV) lint-imports --no-logo --no-cache
 
 image:
 	docker build -t magshell_fenicsx .

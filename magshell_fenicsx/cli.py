@@ -26,6 +26,7 @@ from magshell_fenicsx.command import (
     result_option,
     typer,
 )
+from magshell_fenicsx.platform.interrupt import is_interrupt
 from magshell_fenicsx.platform.packages import Unusable, install_hint
 from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams
@@ -96,7 +97,7 @@ def main() -> None:
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception as e:
-        if _was_interrupted(e):
+        if is_interrupt(e):
             sys.exit(INTERRUPTED)
         if isinstance(e, ImportError) and (advice := install_hint(e)):
             print(advice, file=sys.stderr)
@@ -108,18 +109,6 @@ def main() -> None:
         traceback.print_exc()
         sys.stderr.flush()
         world().Abort(1)  # the other ranks would wait for this one for ever
-
-
-def _was_interrupted(error: BaseException) -> bool:
-    """Return whether an error was caused by KeyboardInterrupt.
-
-    An interrupt within a function that PETSc calls ends PETSc's solve with an error of its own,
-    whose cause it is.
-    """
-    cause = error.__cause__
-    if cause is None:
-        return False
-    return isinstance(cause, KeyboardInterrupt) or _was_interrupted(cause)
 
 
 def _print_version(requested: bool) -> None:

@@ -47,7 +47,6 @@ from magshell_fenicsx.continuation.system import (
 )
 
 TOLERANCE = 1e-9  # of u, in lengths of the system
-SMALL_DISPLACEMENT = 1e-5  # in lengths: smaller ones converge whatever mu is
 MAX_ITERATIONS = 10
 MAX_STEP = 10.0  # in lengths; a longer one counts as divergence
 LOAD_ERROR_FACTOR = 3.0  # load error over the last corrections, which are rounding
@@ -55,8 +54,8 @@ LOAD_ERROR_FACTOR = 3.0  # load error over the last corrections, which are round
 # along v
 EQUILIBRIUM_STEP = 1e-5
 DIFFERENCE_STEP = 1e-4  # relative, of an amplitude
-# in lengths, and relative to a smaller u: steps that are smaller and do not shrink are the rounding
-# of g
+# in lengths, and relative of the amplitude: steps that are smaller and do not shrink are the
+# rounding of g
 ROUNDING_STEP = 1e-2
 FIRST_STEP_SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in lengths of the system
 # the same if the first of these fails, as where the tangent is nearly singular in another direction
@@ -153,14 +152,10 @@ def _find_from_equilibrium(
     # b: the border of the tangent; sizes, load_changes: of the steps so far, in lengths and in mu
     b, sizes, load_changes = phi, list[float](), list[float]()
     while True:
-        size_of_u = max_abs(system.comm, state.u) / system.length
-        if _has_converged(sizes, size_of_u):
-            # The convergence of u does not show that of mu where K is not linear in mu, as in a
-            # prescribed position (one of the system's `coordinates`), or where the shell hardly
-            # deforms along the path.
-            checks_load = name in system.coordinates or size_of_u <= SMALL_DISPLACEMENT
-            if not checks_load or _load_has_converged(load_changes, state.mu[name]):
-                break
+        # the convergence of u does not show that of mu where the shell hardly deforms along the
+        # path, or where K is not linear in mu
+        if _has_converged(sizes) and _load_has_converged(load_changes, state.mu[name]):
+            break
         if len(sizes) == MAX_ITERATIONS:
             raise BifurcationLost
         tangent = AugmentedTangent(newton, state, b)
@@ -275,7 +270,7 @@ def mixed_third_derivative(
     return np.asarray(ratio / 4 * (plus - minus))
 
 
-def _has_converged(sizes: Sequence[float], size_of_u: float) -> bool:
+def _has_converged(sizes: Sequence[float]) -> bool:
     """Return whether the last step is below the tolerance, or as small as rounding allows.
 
     A small step that is not half as long as the one before counts as rounding.
@@ -284,15 +279,13 @@ def _has_converged(sizes: Sequence[float], size_of_u: float) -> bool:
     ----------
     sizes
         Sizes of the steps so far, in lengths of the system.
-    size_of_u
-        Size of the displacement itself.
     """
     if not sizes:
         return False
     if sizes[-1] <= TOLERANCE:
         return True
     stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2
-    return stalled and sizes[-1] <= ROUNDING_STEP * min(size_of_u, 1.0)
+    return stalled and sizes[-1] <= ROUNDING_STEP
 
 
 def _load_has_converged(changes: Sequence[float], mu: float) -> bool:

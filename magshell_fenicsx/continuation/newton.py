@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import (
     BorderedMatrix,
@@ -48,6 +49,7 @@ from magshell_fenicsx.continuation.system import (
     dot,
     max_abs,
 )
+from magshell_fenicsx.platform.interrupt import raise_interrupt
 
 # successive stiffnesses of touching faces, over the final ones; the first is about that of a shell
 STIFFNESS_FRACTIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -254,7 +256,11 @@ class BorderedNewton:
         _, _, step_tolerance, _ = snes.getTolerances()
         callbacks.begin(guess, name, row, step_tolerance, options)
         callbacks.join((guess.u, guess.mu[name]), self._x)
-        snes.solve(None, self._x)
+        try:
+            snes.solve(None, self._x)
+        except PETSc.Error as e:
+            raise_interrupt(e)
+            raise
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
         converged = code > 0
         u, mu = callbacks.split(self._x)

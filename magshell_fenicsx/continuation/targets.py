@@ -14,6 +14,7 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 
 # a step ends at this multiple of the distance to the last target, so that its factors serve there
 END_PAST_TARGET = 1.01
+MIN_FRACTION_OF_STEP = 0.01  # of a planned step that ends behind a target
 MAX_PREDICTORS = 4  # points that a polynomial goes through
 # least distance of these points, over the distance of the two points around a target
 MIN_PREDICTOR_DISTANCE = 0.1
@@ -48,7 +49,7 @@ def end_near_last_target(
     # a little behind the target, even if that is the current point but for rounding, and not behind
     # the planned end
     fraction = END_PAST_TARGET * (_zero(difference, current, s) - current) / (s - current)
-    fraction = max(fraction, END_PAST_TARGET - 1)
+    fraction = max(fraction, MIN_FRACTION_OF_STEP)
     return current + min(fraction, 1.0) * (s - current)
 
 

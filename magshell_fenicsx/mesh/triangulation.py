@@ -6,9 +6,13 @@ follow, such as the edge of a dimple. Opposite sides that are one line of the su
 their nodes have one representative. Lengths are those of the chart, over R.
 """
 
-from collections.abc import Mapping
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -118,7 +122,8 @@ def _gmsh_mesh(
         if precision := getattr(size, "precision", None):
             gmsh.option.setNumber("Mesh.LcIntegrationPrecision", precision)
         gmsh.model.mesh.setSizeCallback(element_size)
-        gmsh.model.mesh.generate(2)
+        with _noting_interrupts(element_size):
+            gmsh.model.mesh.generate(2)
         if element_size.error:
             raise element_size.error
         gmsh.model.mesh.setOrder(ORDER)
@@ -144,7 +149,7 @@ class _ElementSize:
     Attributes
     ----------
     error
-        The first exception, an interrupt included; None if there is none.
+        The first exception, or an interrupt; None if there is none.
     """
 
     def __init__(self, size: Size):
@@ -158,9 +163,30 @@ class _ElementSize:
         if self.error is None:
             try:
                 return self._size(np.array([x, y]))
-            except BaseException as e:
+            except Exception as e:
                 self.error = e
         return inf
+
+
+@contextmanager
+def _noting_interrupts(element_size: _ElementSize) -> Iterator[None]:
+    """Let an interrupt be noted as the error of an element size, in place of raising it.
+
+    Within gmsh it could be raised where gmsh ignores it. A handler of the program's own stays.
+    """
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not raises or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def note(number: int, frame: FrameType | None) -> None:
+        element_size.error = KeyboardInterrupt()
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _halved_at(size: Size, places: Array) -> Size:

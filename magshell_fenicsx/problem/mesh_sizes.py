@@ -36,9 +36,7 @@ UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the larg
 MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
 # sides of triangles at clamped edges of inflated rubber, over the thickness; docs/theory.md, Rubber
 RUBBER_EDGE_SIZE, RUBBER_EDGE_SIZE_AT_DEGREE_3 = 1.0, 2.8
-# the least size of these elements over R, and h/R below which the layer there counts less than the
-# mesh
-MIN_RUBBER_EDGE_SIZE, THIN_RUBBER = 0.014, 1 / 200
+MIN_RUBBER_EDGE_SIZE = 0.014  # of these elements over R
 RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
 EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
 GROWTH = 0.4  # of the size per distance
@@ -203,8 +201,7 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
     """
     h, growth = sizing.h, _growth(context, sizing)
     boundary = context.section_of(BoundarySection)
-    is_thick = h >= THIN_RUBBER
-    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary and is_thick else []
+    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary else []
     size_over_h = RUBBER_EDGE_SIZE if degree_of(context) > 3 else RUBBER_EDGE_SIZE_AT_DEGREE_3
     rubber_size = max(size_over_h * h, MIN_RUBBER_EDGE_SIZE)
     if grid := outline.grid:

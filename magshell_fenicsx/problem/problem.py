@@ -41,7 +41,7 @@ from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.supports.boundary import RUBBER_EDGE_CELL, BoundarySection
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (
     FrequenciesSection,
@@ -55,6 +55,8 @@ from magshell_fenicsx.shape.meridian_chart import MeridianChart
 COUNT_TOLERANCE = 1e-9  # of a number of elements, which is rounded up
 HEIGHT_DIGITS = 9  # decimals of heights in the thickness by which they are one
 CONTACT_CELL_SIZE = 0.08  # over sqrt(Rh): cells of a meridian that resolve the ring of a contact
+# width of a cell at a clamped edge of inflated rubber, over the thickness; docs/theory.md, Rubber
+RUBBER_EDGE_CELL = 1.4
 MAX_MERIDIAN_CELL_SIZE = 0.2  # over sqrt(Rh)
 CELLS_OF_CONTACT = 3  # of a meridian, over the size of a body's contact
 

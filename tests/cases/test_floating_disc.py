@@ -46,6 +46,17 @@ def test_tilt_in_a_reversed_field(field: float) -> None:
     assert share_of_field * field == pytest.approx(-1e3 * CRITICAL, rel=1e-3)
 
 
+def test_tilt_after_a_shift() -> None:
+    """A dead load shifts the disc by its thickness, which changes the critical field in nothing."""
+    case = floating_disc("100 MPa", "-1.2 mT")
+    load = {"over": "all", "per_area": [0, 0, "-0.4 Pa"]}
+    shift = {"kind": "dead", "loads": [load], "factor": 1, "points": 1}
+    rows = run(case | {"loading": [shift, case["loading"]]}).rows
+    tilt, *_ = (row for row in rows if row["label"] == "bifurcation")
+    share_of_field = float(tilt["lambda_m"]) / float(rows[-1]["lambda_m"])
+    assert share_of_field * -1.2 == pytest.approx(-1e3 * CRITICAL, rel=1e-3)
+
+
 def test_a_first_step_that_ends_at_the_target_but_for_rounding() -> None:
     """The next step ends behind the target; it had the length zero, again and again."""
     rows = run(floating_disc("1 GPa", "10 mT")).rows

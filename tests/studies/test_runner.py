@@ -13,7 +13,6 @@ from conftest import CASES
 from mpi4py import MPI
 from pydantic import TypeAdapter
 
-import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.folder import DiskError
@@ -35,16 +34,6 @@ from magshell_fenicsx.studies.runner import (
 
 PLATE = CASES / "clamped_plate.yaml"
 OUTCOME = Outcome.failed("lost", 1.5, 3)
-
-
-def test_no_study_knows_the_case_file() -> None:
-    """Studies stand below the package of the case: they get what makes a case of its source."""
-    package = Path(magshell_fenicsx.__file__).parent
-    files = [*(package / "studies").glob("*.py"), package / "input" / "chance.py"]
-    assert len(files) > 20
-    assert not [
-        file.name for file in files if "magshell_fenicsx.case" in file.read_text(encoding="utf-8")
-    ]
 
 
 def test_an_outcome_is_kept_for_these_sources(

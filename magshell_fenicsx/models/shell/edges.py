@@ -35,7 +35,7 @@ from magshell_fenicsx.models.shell.law import Law
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]
-# width of cells, over the thickness, that show the layer in which stretched rubber bends at an edge
+# h_e over the thickness, below which cells resolve the layer where rubber bends at an edge
 WIDTH_OF_LAYER = 1.5
 FOLD_ANGLE = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 
@@ -206,8 +206,8 @@ def clamped(
     the penalty.
 
     The stiffness of rubber falls with the stretch: an edge that stretched by itself would turn
-    freely. Where cells are so small that they show the layer in which rubber bends, the penalty
-    has the stiffness of small strains. Larger cells would resist the turn as a whole with it.
+    freely. Where cells resolve the layer in which rubber bends, the penalty has the stiffness of
+    small strains. Larger cells would resist the turn as a whole with it.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
@@ -217,8 +217,8 @@ def clamped(
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     if law.linear is not law:
         _, D_at_small_strains = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
-        shows_layer = ufl.lt(width, WIDTH_OF_LAYER * law.h)
-        D = ufl.conditional(shows_layer, D_at_small_strains, D)
+        resolves_layer = ufl.lt(width, WIDTH_OF_LAYER * law.h)
+        D = ufl.conditional(resolves_layer, D_at_small_strains, D)
     return edge_density(M, D, J, width, sigma) * stretch
 
 

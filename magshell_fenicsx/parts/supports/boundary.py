@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.parts.ability import Ability, Context, Offer
-from magshell_fenicsx.parts.shell_sections import ShellSection
+from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES, ShellSection
 from magshell_fenicsx.shape.symmetry_constraint import (
     PARALLEL,
     SymmetryConstraint,
@@ -31,11 +31,18 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-# width of a meridian's cell at a clamped edge of inflated rubber, over the thickness
-RUBBER_EDGE_CELL = 1.4
+THIN_RUBBER = 200  # R/h beyond which the layer at a clamped edge counts less than the mesh
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
 EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
+
+
+def _inflates(load: Any, *, is_flat: bool) -> bool:
+    """Return whether the load of a step blows up a shell: from inside, or a flat one at all."""
+    if load.kind != "pressure":
+        return False
+    pressures_from_inside = [-(load.pressure or 0.0), load.volume_change or 0.0]
+    return is_flat or max(pressures_from_inside) > 0 or "inside" in (load.on or {}).values()
 
 
 class HeldSection(Section):
@@ -93,9 +100,15 @@ class BoundarySection(Section, Ability):
         return dict(self.__pydantic_extra__ or {})
 
     def edges_of_inflated_rubber(self, context: Context) -> list[str]:
-        """Return names of clamped edges at which rubber under pressure bends in a narrow layer."""
-        is_inflated = any(step.kind == "pressure" for step in context.steps)
-        if getattr(context.shell, "rubber", None) is None or not is_inflated:
+        """Return names of clamped edges at which inflated rubber bends in a narrow layer.
+
+        There are none in a solid, and in a shell so thin that the layer counts less than the mesh.
+        """
+        shell = context.shell
+        if context.solid or getattr(shell, "rubber", None) is None or shell.R_over_h > THIN_RUBBER:
+            return []
+        is_flat = shell.geometry in FLAT_GEOMETRIES
+        if not any(_inflates(step.load, is_flat=is_flat) for step in context.steps):
             return []
         return [name for name, condition in self.conditions().items() if condition == "clamped"]
 
@@ -109,9 +122,9 @@ class BoundarySection(Section, Ability):
             return None
         return (
             f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
-            "is thick, which no shell theory describes: far beyond the largest pressure, or with "
-            "elements along this edge that are wider, instabilities may be false; hinged is "
-            "right, and a clamped edge raises the fold by less than h/R"
+            "is thick, which no shell theory describes: instabilities may be false far beyond the "
+            "largest pressure, or with wider elements along this edge; hinged is right, and a "
+            "clamped edge raises the fold by less than h/R"
         )
 
     def refuse_unfit(self, context: Context) -> None:
