@@ -49,7 +49,7 @@ from magshell_fenicsx.continuation.system import (
     dot,
     max_abs,
 )
-from magshell_fenicsx.platform.interrupt import raise_interrupt
+from magshell_fenicsx.platform.interrupt import is_interrupt
 
 # successive stiffnesses of touching faces, over the final ones; the first is about that of a shell
 STIFFNESS_FRACTIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -259,7 +259,8 @@ class BorderedNewton:
         try:
             snes.solve(None, self._x)
         except PETSc.Error as e:
-            raise_interrupt(e)
+            if is_interrupt(e):
+                raise KeyboardInterrupt from None
             raise
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
         converged = code > 0

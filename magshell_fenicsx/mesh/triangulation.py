@@ -122,7 +122,7 @@ def _gmsh_mesh(
         if precision := getattr(size, "precision", None):
             gmsh.option.setNumber("Mesh.LcIntegrationPrecision", precision)
         gmsh.model.mesh.setSizeCallback(element_size)
-        with _noting_interrupts(element_size):
+        with _deferred_interrupts(element_size):
             gmsh.model.mesh.generate(2)
         if element_size.error:
             raise element_size.error
@@ -169,10 +169,10 @@ class _ElementSize:
 
 
 @contextmanager
-def _noting_interrupts(element_size: _ElementSize) -> Iterator[None]:
-    """Let an interrupt be noted as the error of an element size, in place of raising it.
+def _deferred_interrupts(element_size: _ElementSize) -> Iterator[None]:
+    """Note an interrupt as the error of an element size, in place of raising it within gmsh.
 
-    Within gmsh it could be raised where gmsh ignores it. A handler of the program's own stays.
+    gmsh ignores what is raised in its callback. Another handler of the program stays.
     """
     raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not raises or threading.current_thread() is not threading.main_thread():

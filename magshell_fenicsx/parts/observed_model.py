@@ -1,4 +1,4 @@
-"""What parts read of a model to observe a state: the protocol of the models in packages above.
+"""Protocol of a model, as far as parts read it to observe a state.
 
 Lengths are over R, forces over E h R; E, h and R are Young's modulus, thickness and reference
 length. An amplitude is a load parameter, by name.

@@ -8,15 +8,3 @@ def is_interrupt(error: BaseException) -> bool:
     """Return whether an error was caused by KeyboardInterrupt, directly or through other errors."""
     cause = error.__cause__
     return cause is not None and (isinstance(cause, KeyboardInterrupt) or is_interrupt(cause))
-
-
-def raise_interrupt(error: BaseException) -> None:
-    """Raise KeyboardInterrupt if it is the cause of an error.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        In place of the error.
-    """
-    if is_interrupt(error):
-        raise KeyboardInterrupt from None

@@ -23,7 +23,7 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import SizingContext
-from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.parts.supports.boundary import BoundarySection, edges_of_inflated_rubber
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
@@ -200,11 +200,11 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
     edges of inflated rubber, where sizes do not depend on the refinement.
     """
     h, growth = sizing.h, _growth(context, sizing)
-    boundary = context.section_of(BoundarySection)
-    rubber_edges = boundary.edges_of_inflated_rubber(context) if boundary else []
+    rubber_edges = edges_of_inflated_rubber(context)
     size_over_h = RUBBER_EDGE_SIZE if degree_of(context) > 3 else RUBBER_EDGE_SIZE_AT_DEGREE_3
     rubber_size = max(size_over_h * h, MIN_RUBBER_EDGE_SIZE)
     if grid := outline.grid:
+        boundary = context.section_of(BoundarySection)
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()

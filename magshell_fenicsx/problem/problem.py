@@ -41,7 +41,7 @@ from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.supports.boundary import BoundarySection
+from magshell_fenicsx.parts.supports.boundary import edges_of_inflated_rubber
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (
     FrequenciesSection,
@@ -493,8 +493,7 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         # the size that the case gives for all cells, over R; None without
         everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )
-    boundary = problem.context.section_of(BoundarySection)
-    rubber_edges = boundary.edges_of_inflated_rubber(problem.context) if boundary else []
+    rubber_edges = edges_of_inflated_rubber(problem.context)
     ends = zip((0.0, meridian.length), (meridian.names[0], meridian.names[-1]), strict=True)
     for end, name in ends:
         if name in rubber_edges:

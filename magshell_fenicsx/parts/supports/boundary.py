@@ -37,14 +37,6 @@ Axis = Literal["x", "y", "z"]
 EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
 
 
-def _inflates(load: Any, *, is_flat: bool) -> bool:
-    """Return whether the load of a step blows up a shell: from inside, or a flat one at all."""
-    if load.kind != "pressure":
-        return False
-    pressures_from_inside = [-(load.pressure or 0.0), load.volume_change or 0.0]
-    return is_flat or max(pressures_from_inside) > 0 or "inside" in (load.on or {}).values()
-
-
 class HeldSection(Section):
     """Some components of the displacement are zero; rotations are free."""
 
@@ -99,25 +91,12 @@ class BoundarySection(Section, Ability):
         """Return name of each edge, point or patch -> its condition."""
         return dict(self.__pydantic_extra__ or {})
 
-    def edges_of_inflated_rubber(self, context: Context) -> list[str]:
-        """Return names of clamped edges at which inflated rubber bends in a narrow layer.
-
-        There are none in a solid, and in a shell so thin that the layer counts less than the mesh.
-        """
-        shell = context.shell
-        if context.solid or getattr(shell, "rubber", None) is None or shell.R_over_h > THIN_RUBBER:
-            return []
-        is_flat = shell.geometry in FLAT_GEOMETRIES
-        if not any(_inflates(step.load, is_flat=is_flat) for step in context.steps):
-            return []
-        return [name for name, condition in self.conditions().items() if condition == "clamped"]
-
     def warning(self, context: Context, places: Array) -> str | None:
         """Return a warning if pressure blows up rubber beside a clamped edge; None if not.
 
         Several shells are not looked at. `places` are not used here.
         """
-        edges = self.edges_of_inflated_rubber(context)
+        edges = edges_of_inflated_rubber(context)
         if not edges or getattr(context.shell, "assembly", None) is not None:
             return None
         return (
@@ -226,3 +205,26 @@ def refuse_taken(points: Iterable[str]) -> None:
             raise ValueError(
                 f"points.{point}: is taken, by the point that is indented; choose another name"
             )
+
+
+def edges_of_inflated_rubber(context: Context) -> list[str]:
+    """Return names of clamped edges at which inflated rubber bends in a narrow layer.
+
+    There are none in a solid, and in a shell so thin that the layer counts less than the mesh.
+    """
+    shell, boundary = context.shell, context.section_of(BoundarySection)
+    if boundary is None or context.solid or getattr(shell, "rubber", None) is None:
+        return []
+    is_flat = shell.geometry in FLAT_GEOMETRIES
+    inflated = any(_inflates(step.load, is_flat=is_flat) for step in context.steps)
+    if not inflated or shell.R_over_h > THIN_RUBBER:
+        return []
+    return [name for name, condition in boundary.conditions().items() if condition == "clamped"]
+
+
+def _inflates(load: Any, *, is_flat: bool) -> bool:
+    """Return whether the load of a step blows up a shell: from inside, or a flat one at all."""
+    if load.kind != "pressure":
+        return False
+    pressures_from_inside = [-(load.pressure or 0.0), load.volume_change or 0.0]
+    return is_flat or max(pressures_from_inside) > 0 or "inside" in (load.on or {}).values()
