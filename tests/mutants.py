@@ -33,7 +33,7 @@ GROUPS = {
     "mechanics": (
         "models",
         "shells",
-        "parts/rubber.py",
+        "parts/laws",
         "parts/laminate.py",
         "parts/natural",
         "parts/joints.py",

@@ -443,11 +443,12 @@ class _ImperfectShell:
 
 
 def _material(case: Case) -> Material:
-    """Return Poisson's ratio, thickness over R and rubber law of a case, without plies.
+    """Return Poisson's ratio, thickness over R and law of a case, without plies.
 
     Several shells have one material each, by patch.
     """
-    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
+    nu, h = case.shell.poisson_ratio, 1 / case.shell.R_over_h
+    material = Material(nu, h, case.shell.law_section.elastic_law(h, nu))
     if several := case.several:
         return replace(
             material, shells=several.materials, laws=several.laws, laminates=several.laminates

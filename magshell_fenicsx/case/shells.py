@@ -336,10 +336,9 @@ class SeveralShells:
         from magshell_fenicsx.models.shell.parameters import Material
 
         first_shell = self.parts[0].case.shell
-        laminate = self.laminates.get(part.name)
-        return Material(
-            first_shell.poisson_ratio, 1 / first_shell.R_over_h, part.case.shell.rubber, laminate
-        ).law
+        nu, h = first_shell.poisson_ratio, 1 / first_shell.R_over_h
+        elastic_law = part.case.shell.law_section.elastic_law(h, nu)
+        return Material(nu, h, elastic_law, self.laminates.get(part.name)).law
 
     @cached_property
     def laminates(self) -> "dict[str, Laminate]":

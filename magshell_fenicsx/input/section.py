@@ -14,7 +14,7 @@ from functools import cache, reduce
 from math import isnan, nan
 from operator import or_
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -495,12 +495,8 @@ def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
     }
 
 
-# See `parts.rubber.LawKeys.rubber`.
-Rubberlike: TypeAlias = float | tuple[tuple[float, ...], tuple[float, ...]]
-
-
 class Sized(Protocol):
-    """The sizes and the material of a shell, which a case may give with or without units.
+    """The sizes of a shell, which a case may give with or without units.
 
     Attributes
     ----------
@@ -522,9 +518,6 @@ class Sized(Protocol):
     def youngs_modulus(self) -> float | None: ...
     @property
     def R_over_h(self) -> float: ...
-
-    @property
-    def rubber(self) -> Rubberlike | None: ...
     @property
     def poisson_ratio(self) -> float: ...
     @property

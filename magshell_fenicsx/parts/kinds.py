@@ -1,21 +1,29 @@
-"""The kinds of bodies, imperfections and sources: each is a file of its package, with its section.
+"""The kinds of bodies, imperfections, sources and laws: each is a file, with its section.
 
 A new kind is such a file, named after it, and its name here. A section is the part of a case under
-a key, as a pydantic model; its key `kind` chooses the class.
+a key, as a pydantic model; its key `kind` chooses the class, of laws the key `law` of a shell.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
 
-from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    model_validator,
+)
 
+from magshell_fenicsx.input.messages import meaning
 from magshell_fenicsx.input.section import ChosenByKey, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.laminate import LaminateSection
+from magshell_fenicsx.parts.laws.law_section import LawSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import Branches, Time
-from magshell_fenicsx.parts.rubber import LawKeys
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
@@ -25,29 +33,24 @@ REGISTERED: dict[str, tuple[str, ...]] = {
     "bodies": ("plane", "sphere", "cylinder", "rod", "box", "ellipsoid"),
     "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
     "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
+    "laws": ("koiter", "neo-hookean", "mooney-rivlin", "ogden"),
 }
 
 
 def section_of(package: str, kind: str) -> type[Section]:
     """Return the section class of a kind in a package of kinds, such as "bodies".
 
-    It is the one class in the file of the kind with this value of the key `kind`.
+    It is the one class in the file of the kind with this value of the key `kind`, or `law`.
     """
-    module = import_module(f"{__package__}.{package}.{kind}")
-    # what the module itself defines, without what it imports
-    module_members = (
-        member
-        for member in vars(module).values()
-        if getattr(member, "__module__", "") == module.__name__
-    )
-    sections = [
-        member
-        for member in module_members
-        if isinstance(member, type) and issubclass(member, Section)
-    ]
+    module = import_module(f"{__package__}.{package}.{kind.replace('-', '_')}")
+    key = "law" if package == "laws" else "kind"
+    # classes that the module itself defines; `isinstance` would import a lazy module
+    classes = [member for member in vars(module).values() if issubclass(type(member), type)]
+    own_classes = [member for member in classes if member.__module__ == module.__name__]
+    sections = [member for member in own_classes if issubclass(member, Section)]
     # the values of the key's Literal are the kinds of the class: one class has this kind
     (section,) = (
-        member for member in sections if kind in get_args(member.model_fields["kind"].annotation)
+        member for member in sections if kind in get_args(member.model_fields[key].annotation)
     )
     return section
 
@@ -63,13 +66,96 @@ if TYPE_CHECKING:
     Imperfection = ImperfectionSection
     Source = SourceSection
     Dimple = DimpleSection
+    LawName = str
 else:
-    Body, Imperfection, Source = map(_any_of, REGISTERED)
+    Body = _any_of("bodies")
+    Imperfection = _any_of("imperfections")
+    Source = _any_of("magnetism.sources")
     Dimple = section_of("imperfections", "dimple")
+    LawName = Literal[REGISTERED["laws"]]
 
 Bodies = Annotated[dict[str, Body], Field(max_length=100)]
 Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
+
+
+LAWS: dict[str, type[LawSection]] = {name: section_of("laws", name) for name in REGISTERED["laws"]}
+SECTION_BY_KEY = {key: section for section in LAWS.values() for key in section.own_keys()}
+LAW_KEYS = tuple(SECTION_BY_KEY)
+
+
+class LawChoice(Section):
+    """The key of a shell that chooses its law; the keys of all laws are added to it."""
+
+    law: LawName = "koiter"
+    """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6
+    (C10 + C01)"""
+
+    @property
+    def law_section(self) -> LawSection:
+        """The law with its keys."""
+        section = LAWS[self.law]
+        return section.model_construct(law=self.law, **self._values_of(section))
+
+    @model_validator(mode="after")
+    def _law_fits(self) -> Self:
+        """Check that keys of a law go with this law alone, and that rubber is incompressible."""
+        for name, section in LAWS.items():
+            self._refuse_misplaced(section, is_chosen=name == self.law)
+        try:
+            LAWS[self.law].model_validate({"law": self.law, **self._values_of(LAWS[self.law])})
+        except ValidationError as e:
+            raise ValueError(e.errors()[0]["msg"].removeprefix("Value error, ")) from None
+        # a key of the shells that inherit from this class, not of the class itself
+        nu = getattr(self, "poisson_ratio", 0.5)
+        if self.law_section.incompressible and nu != 0.5:
+            raise ValueError(
+                f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: "
+                "koiter"
+            )
+        return self
+
+    def _refuse_misplaced(self, section: type[LawSection], *, is_chosen: bool) -> None:
+        """Refuse keys of a law without it, the law without them, and lists of unequal lengths.
+
+        `is_chosen` says whether the shell has this law. Lists have a number for each term of the
+        law's energy.
+        """
+        values = self._values_of(section)
+        lengths = [
+            len(value or [])
+            for key, value in values.items()
+            if get_origin(section.model_fields[key].annotation) is list
+        ]
+        is_given = {value is not None for value in values.values()}
+        if is_given <= {is_chosen} and len({*lengths}) <= 1:
+            return
+        counts = f", with {' and '.join(map(str, lengths))} numbers" if lengths else ""
+        raise ValueError(
+            f"{', '.join(values)}: {section.keys_text}; here the law is {self.law}{counts}"
+        )
+
+    def _values_of(self, section: type[LawSection]) -> dict[str, Any]:
+        """Return the keys of a law -> their values in this shell, None where it has none."""
+        return {key: getattr(self, key) for key in section.own_keys()}
+
+
+def _optional_key(section: type[LawSection], key: str) -> tuple[Any, Any]:
+    """Return type and default of a law's key where a shell may be without it."""
+    field = section.model_fields[key]
+    given = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    return given | None, Field(default=None, description=meaning(section, key))
+
+
+if TYPE_CHECKING:
+    LawKeys = LawChoice
+else:
+    LawKeys = create_model(
+        "LawKeys",
+        __base__=LawChoice,
+        __module__=__name__,
+        **{key: _optional_key(section, key) for key, section in SECTION_BY_KEY.items()},
+    )
 
 
 class ShellKeys(LawKeys):

@@ -61,7 +61,7 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "natural.section.NaturalSection",
     "imperfections.imperfection.Imperfect",
     "laminate.ShellLaminate",
-    "rubber.RubberMaterial",
+    "laws.rubber_material.RubberMaterial",
     "motion.history.ViscousMaterial",
     "bodies.body.RigidBodies",
     "contact.contact_section.ShellContact",

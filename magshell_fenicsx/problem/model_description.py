@@ -12,9 +12,10 @@ from magshell_fenicsx.mesh.mirror import Mirror, Sector, plane_text
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS
 from magshell_fenicsx.parts.laminate import laminate_account
+from magshell_fenicsx.parts.laws.law_section import LawSection, law_account
+from magshell_fenicsx.parts.laws.rubber_material import laws_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.registered import PART_CLASSES, accounts, parts_of
-from magshell_fenicsx.parts.rubber import law_account, laws_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import SolidBody, solid_body_of
 
@@ -37,7 +38,7 @@ def describe_model(
     """
     # the law, and what each part of the case has to say
     body = solid_body_of(context)
-    included = [model, _body_text(body) if body else _law_text(context)]
+    included = [model, _body_text(body, context.shell.law_section) if body else _law_text(context)]
     left_out = list[str]()
     for part_account in accounts(context, loads):
         included += part_account.included
@@ -105,15 +106,17 @@ def _law_text(context: Context) -> str:
         return f"membrane and bending energy, each of its own law: {', '.join(laws)}"
     if laminate:
         return laminate_account(laminate, context.shell)
-    return law_account(context.shell.rubber)
+    return law_account(context.shell.law_section)
 
 
-def _body_text(body: SolidBody) -> str:
-    """Return a phrase about the law and the elements of a solid."""
+def _body_text(body: SolidBody, law: LawSection) -> str:
+    """Return a phrase about the law and the elements of a solid, whose shell has a law."""
+    assert law.in_solid
     material, count = body.material, len(body.layer_bounds) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
-    law, share = "neo-Hookean energy", material.share
-    if share:
-        law = f"Mooney-Rivlin energy, C01/C10 = {share / (1 - share):.5g}"
-    return f"{law}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
+    numbers_text = law.in_solid.numbers_text
+    energy_text = f"{law.in_solid.title} energy{', ' * bool(numbers_text)}{numbers_text}"
+    return (
+        f"{energy_text}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
+    )

@@ -34,7 +34,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, with_
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Mode
@@ -71,7 +71,7 @@ class SolidBody:
         Heights at which the elements begin and end, from 0 inside to 1 outside.
     """
 
-    material: MooneyRivlin
+    material: CompressibleRubber
     layer_bounds: list[float]
 
 
@@ -83,10 +83,12 @@ def solid_body_of(context: Context) -> SolidBody | None:
     if not context.solid:
         return None
     shell, bulk_to_shear = context.shell, _solid_section(context).bulk_to_shear
-    second_share = shell.rubber or 0.0
-    assert isinstance(second_share, float)  # Ogden's law needs a mid-surface
+    law = shell.law_section.in_solid
+    assert law  # another law needs a mid-surface
     return SolidBody(
-        MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, bulk_to_shear, second_share),
+        CompressibleRubber.from_poisson_ratio(
+            law.strain_energy(), shell.poisson_ratio, bulk_to_shear
+        ),
         layer_bounds(context),
     )
 

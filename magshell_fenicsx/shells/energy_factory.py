@@ -41,6 +41,7 @@ from magshell_fenicsx.models.shell.energy import (
     Parameter,
     ShellTerm,
     constants_of,
+    elastic_density,
     per_area,
 )
 from magshell_fenicsx.models.shell.kinematics import (
@@ -51,7 +52,7 @@ from magshell_fenicsx.models.shell.kinematics import (
     Edge,
     Jet,
 )
-from magshell_fenicsx.models.shell.law import Law, LawByShell, elastic_density
+from magshell_fenicsx.models.shell.law import Law, LawByShell
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.spatial_fields import pattern_field

@@ -44,7 +44,7 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     body_positions_and_normals,
     field_in_body,
 )
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.forces.load_vectors import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.loads import Loads, moments, potentials
@@ -68,7 +68,7 @@ MIRRORS = ("symmetry", "plane")  # conditions on mirror planes
 
 
 class SolidModel(ModelBase):
-    """A neo-Hookean, hard-magnetic body around a mid-surface.
+    """A rubbery, hard-magnetic body around a mid-surface.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class SolidModel(ModelBase):
         self,
         body: BodyMesh,
         material: Material,
-        law: MooneyRivlin,
+        law: CompressibleRubber,
         conditions: Mapping[str, Condition],
         loads: Loads,
         mirror: Mirror = Y0_PLANE,
@@ -165,7 +165,7 @@ class SolidModel(ModelBase):
         self.loads = replace(loads, user_terms=user_terms)
         self.factory = factory = self._make_factory()
         # the first term is everywhere: its form gives the sparsity pattern
-        self._pattern, *areal_distortion = factory.distortions()
+        self._pattern = factory.distortion()
         # supports, and the planes of the body's own symmetry; a point on all planes, or None
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
@@ -175,7 +175,7 @@ class SolidModel(ModelBase):
             self.r0, ends, conditions, in_middle(body, self.V)
         )
         is_enclosed = enclosed(self.loads, free_ends, self.without_potential)
-        self._terms: list[Term] = [self._pattern, *areal_distortion, factory.compression()]
+        self._terms: list[Term] = [self._pattern, factory.compression()]
         self._terms += self._field_and_pressure_terms()
         self._terms += [factory.user_term(term) for term in self.loads.user_terms if term.density]
         self.observed = self._observed_forms()

@@ -15,6 +15,7 @@ flux density known by its values at displaced places, as of a magnet.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import basix
@@ -39,7 +40,7 @@ from magshell_fenicsx.models.shell.kinematics import ALL_DERIVATIVES, SECOND_DER
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.spatial_fields import field_in_body, radial
 from magshell_fenicsx.models.solid import body_densities
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
@@ -128,7 +129,7 @@ class TermFactory:
     u
         Displacement over R.
     material
-        Elastic law, with shear modulus, share of areal distortion, and bulk modulus over E.
+        Elastic law, with its moduli over E.
     h
         Thickness over R.
     log
@@ -147,7 +148,7 @@ class TermFactory:
 
     body: BodyMesh
     u: fem.Function
-    material: MooneyRivlin
+    material: CompressibleRubber
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
@@ -156,27 +157,12 @@ class TermFactory:
     fields: list[AppliedField] = field(default_factory=list)
     saturated: list[PointField] = field(default_factory=list)
 
-    def distortions(self) -> list[SolidTerm]:
-        """Return the terms of distortion without change of volume (Mooney and Rivlin's law).
-
-        A neo-Hookean body has one term, others a second one of areal distortion, which has a share
-        of the shear modulus.
-        """
-        shear, areal_share = self.material.shear, self.material.share
-        # name of the term -> density, and its share of the shear modulus
-        densities_and_shares = {
-            "distortion": (body_densities.distortion, 1 - areal_share),
-            "areal distortion": (body_densities.areal_distortion, areal_share),
-        }
-        return [
-            self._bulk(
-                name,
-                self.grown(SolidDensity(density, self._constants(share_of_shear * shear, self.h))),
-                group="distortion",
-            )
-            for name, (density, share_of_shear) in densities_and_shares.items()
-            if share_of_shear or name == "distortion"
-        ]
+    def distortion(self) -> SolidTerm:
+        """Return the term of distortion without change of volume."""
+        material = self.material
+        parameters = self._constants(material.shear, self.h, *material.energy.constants)
+        density = partial(body_densities.distortion, energy=material.energy.function)
+        return self._bulk("distortion", self.grown(SolidDensity(density, parameters)))
 
     def compression(self) -> SolidTerm:
         """Return the term of volume change, kappa/2 (J - 1)^2, with reduced quadrature.

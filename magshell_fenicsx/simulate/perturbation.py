@@ -22,17 +22,16 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
+from magshell_fenicsx.parts.kinds import LAW_KEYS
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.problem.requests import GRADIENT_FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 MATERIAL_KEYS = (
-    "alpha",
+    *LAW_KEYS,
     "density",
     "laminate",
-    "mooney",
-    "mu",
     "poisson_ratio",
     "radius_to_thickness",
     "thickness",

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from conftest import CASES
-from ogdens import ALPHA, MU, TRELOAR
+from rubbers import ALPHA, MU, TRELOAR
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import brentq, fsolve

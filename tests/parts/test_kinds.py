@@ -1,5 +1,5 @@
-"""The kinds of bodies, imperfections and sources: every file is in the list, and lengths are found
-by their types.
+"""The kinds of bodies, imperfections, sources and laws: every file is in the list, and lengths are
+found by their types.
 """
 
 from importlib import import_module
@@ -25,8 +25,9 @@ def kinds_of(module: str) -> set[str]:
         for each in vars(import_module(module)).values()
         if getattr(each, "__module__", "") == module
     ]
+    key = "law" if module.startswith(f"{PARTS}.laws.") else "kind"
     fields = [
-        each.model_fields.get("kind")
+        each.model_fields.get(key)
         for each in own
         if isinstance(each, type) and issubclass(each, Section)
     ]
@@ -38,10 +39,12 @@ def test_every_file_with_a_kind_is_in_the_list(room: str) -> None:
     """But for steps, which have a list of their own."""
     (folder,) = import_module(f"{PARTS}.{room}").__path__
     names = [each.name for each in iter_modules([folder])]
-    files = {name for name in names if name in kinds_of(f"{PARTS}.{room}.{name}")}
+    kinds = {name: name.replace("_", "-") if room == "laws" else name for name in names}
+    files = {kind for name, kind in kinds.items() if kind in kinds_of(f"{PARTS}.{room}.{name}")}
     assert files == set(REGISTERED[room])
     for kind in REGISTERED[room]:
-        assert Path(str(import_module(section_of(room, kind).__module__).__file__)).stem == kind
+        stem = Path(str(import_module(section_of(room, kind).__module__).__file__)).stem
+        assert kinds[stem] == kind
 
 
 CAP = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "poisson_ratio": 0.3}

@@ -12,7 +12,7 @@
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, TypeAlias
 
@@ -29,6 +29,7 @@ from magshell_fenicsx.assembly.terms import AngleTerm, DensityTerm
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import FIRST_DERIVATIVES, Jet
+from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.own_term import FormulaParameter, Free, OwnTerm
 from magshell_fenicsx.platform import compat
 
@@ -270,3 +271,66 @@ def constants_of(
         return constant(p)
 
     return tuple(constant_or_field(p) for p in term.parameters)
+
+
+def elastic_density(
+    density: Density,
+    law: Law,
+    thickness: Parameter | None = None,
+    cell_materials: Parameter | None = None,
+) -> Density:
+    """Return a density whose law is made of parameters, from one that takes a keyword `law`.
+
+    The numbers of the law are appended to the density's parameters, then the fields. So other
+    numbers need no new kernel. On interior edges the given density takes a pair of laws.
+
+    Parameters
+    ----------
+    density
+        The density, whose function has the keyword `law`.
+    law
+        The law.
+    thickness
+        Field (1,) that multiplies the thickness; None for 1.
+    cell_materials
+        Field (4,) of `ShellMaterial.numbers` (modulus, nu, density, number of the law); None for
+        one material.
+    """
+
+    def by_side(value: Any) -> Sequence[Any]:
+        """Return a field's values on all sides as a sequence; of one side a bare value is given."""
+        return value if density.sides == 2 else [value]
+
+    def with_law(*arguments: Expr, **keywords: Any) -> Expr:
+        """Return the density's value.
+
+        The arguments are first the density's own, then the numbers of the law, then thickness and
+        materials if there are such fields.
+        """
+        # fields are taken off from the end: the materials on all sides, then the thickness; what is
+        # left ends with the numbers of the law
+        arguments_left, factors, materials = list(arguments), [1] * density.sides, None
+        if cell_materials is not None:
+            materials = by_side(arguments_left.pop())
+        if thickness is not None:
+            factors = [factor[0] for factor in by_side(arguments_left.pop())]
+        count = len(arguments_left) - len(law.numbers)
+        own_arguments, numbers = arguments_left[:count], arguments_left[count:]
+        laws = [law.with_numbers(*numbers).thicker(factor) for factor in factors]  # on each side
+        if materials is not None:
+            # components 0, 1 and 3 are modulus, nu and number of the law; the density is not used
+            laws = [
+                side_law.with_material(material[0], material[1], material[3])
+                for side_law, material in zip(laws, materials, strict=True)
+            ]
+        law_argument = tuple(laws) if density.sides == 2 else laws[0]
+        return density.function(*own_arguments, law=law_argument, **keywords)
+
+    fields = (field for field in (thickness, cell_materials) if field is not None)
+    parameters = (*density.parameters, *law.numbers, *fields)
+    return replace(
+        density,
+        function=with_law,
+        parameters=parameters,
+        reference_parts=("r",) if law.depends_on_place else density.reference_parts,
+    )

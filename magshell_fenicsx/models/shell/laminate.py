@@ -95,10 +95,12 @@ class Laminate:
 
 @dataclass(frozen=True)
 class Laminated(Law):
-    """The law of a laminate; its parameter is the Poisson's ratio of the units.
+    """The law of a laminate.
 
     Attributes
     ----------
+    nu
+        Poisson's ratio with which the stiffness of the units is defined, no property of the plies.
     A, B, D
         Over E h, E h^2 and E h^3, each as 11, 12, 22, 16, 26, 66.
     axis
@@ -112,11 +114,12 @@ class Laminated(Law):
         Components, with index down, of the angle 0 at a point, of any length; see `at_point`.
     """
 
-    A: Stiffness = field(default=(), kw_only=True)
-    B: Stiffness = field(default=(), kw_only=True)
-    D: Stiffness = field(default=(), kw_only=True)
-    axis: Any = field(default=(1.0, 0.0, 0.0), kw_only=True)
-    origin: Any = field(default=(0.0, 0.0, 0.0), kw_only=True)
+    nu: Scalar
+    A: Stiffness
+    B: Stiffness
+    D: Stiffness
+    axis: Any
+    origin: Any
     meridian: bool = field(default=False, kw_only=True)
     direction: tuple[Scalar, Scalar] = field(default=(1.0, 0.0), kw_only=True)
 
@@ -132,17 +135,7 @@ class Laminated(Law):
         # meridians are those about the shell's e3
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
         axis, origin = tuple(map(float, axis_in_model)), tuple(map(float, laminate.origin))
-        return cls(h, nu, A=A, B=B, D=D, axis=axis, origin=origin, meridian=meridian)
-
-    @property
-    def numbers(self) -> tuple[Any, ...]:
-        return self.h, self.parameter, self.A, self.B, self.D, self.axis, self.origin
-
-    def with_numbers(self, *numbers: Any) -> Self:
-        names = "h", "parameter", "A", "B", "D", "axis", "origin"
-        return replace(
-            self, thickness_factor=1, modulus_factor=1, **dict(zip(names, numbers, strict=True))
-        )
+        return cls(h, nu, A, B, D, axis, origin, meridian=meridian)
 
     @property
     def depends_on_place(self) -> bool:
@@ -174,7 +167,10 @@ class Laminated(Law):
     @property
     def bending_stiffness(self) -> Scalar:
         return Koiter(
-            self.h, self.parameter, self.thickness_factor, self.modulus_factor
+            self.h,
+            self.nu,
+            thickness_factor=self.thickness_factor,
+            modulus_factor=self.modulus_factor,
         ).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:

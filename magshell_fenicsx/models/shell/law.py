@@ -11,21 +11,24 @@ point and for arrays of NumPy over many points.
 - The numbers of a law, in a fixed order, become parameters of the densities.
 - A side is one of the cells beside a point: two on an interior edge, else one.
 
-A further law is a `Law`, and a line in `parameters.Material.law`.
+A law that is none of rubber with an energy of invariants (`rubber.Rubber`) is a subclass of `Law`.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Self, TypeAlias
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
-import ufl
-from ufl.core.expr import Expr
 
-from magshell_fenicsx.models.shell.energy import Density, Parameter
+from magshell_fenicsx.models.strain_energy import Scalar, is_expression
+from magshell_fenicsx.platform.lazy_import import lazy_import
 
-Scalar: TypeAlias = Any  # a number, an expression, or an array (...)
+if TYPE_CHECKING:
+    import ufl
+else:
+    ufl = lazy_import("ufl")
+
 Tensor: TypeAlias = Any  # an expression (2, 2), or an array (..., 2, 2)
 Components: TypeAlias = tuple[
     Scalar, Scalar, Scalar
@@ -36,12 +39,13 @@ Components: TypeAlias = tuple[
 class Law(ABC):
     """The law of a material, as energies, edges, pictures and motions use it.
 
+    The numbers of a law, which become parameters of the densities, are its fields that are given by
+    position.
+
     Attributes
     ----------
     h
         The thickness over R by which energies are divided.
-    parameter
-        The law's own number.
     thickness_factor
         Factor of the thickness.
     modulus_factor
@@ -53,9 +57,8 @@ class Law(ABC):
     """
 
     h: Scalar
-    parameter: Scalar
-    thickness_factor: Scalar = 1
-    modulus_factor: Scalar = 1
+    thickness_factor: Scalar = field(default=1, kw_only=True)
+    modulus_factor: Scalar = field(default=1, kw_only=True)
 
     @property
     def thins(self) -> Scalar:
@@ -72,14 +75,19 @@ class Law(ABC):
 
         They become parameters of the densities; some laws have vectors among them.
         """
-        return self.h, self.parameter
+        return tuple(getattr(self, name) for name in self._names_of_numbers)
 
     def with_numbers(self, *numbers: Any) -> Self:
         """Return the law with other numbers, in the order of `numbers`.
 
         Its `thickness_factor` and `modulus_factor` are 1.
         """
-        return type(self)(*numbers)
+        by_name = dict(zip(self._names_of_numbers, numbers, strict=True))
+        return replace(self, thickness_factor=1, modulus_factor=1, **by_name)
+
+    @property
+    def _names_of_numbers(self) -> list[str]:
+        return [number.name for number in fields(self) if not number.kw_only]
 
     @property
     def depends_on_place(self) -> bool:
@@ -178,17 +186,18 @@ class Law(ABC):
 class Koiter(Law):
     """Koiter's law: stress is linear in strain, stretching and bending are independent.
 
-    Its number is Poisson's ratio.
+    Attributes
+    ----------
+    nu
+        Poisson's ratio.
     """
 
-    @property
-    def nu(self) -> Scalar:
-        return self.parameter
+    nu: Scalar
 
     def with_material(
         self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0
     ) -> "Koiter":
-        return replace(self, modulus_factor=modulus_factor * self.modulus_factor, parameter=nu)
+        return replace(self, modulus_factor=modulus_factor * self.modulus_factor, nu=nu)
 
     @property
     def bending_stiffness(self) -> Scalar:
@@ -369,7 +378,7 @@ class LawByShell(Law):
         value_at_place = values[0]
         # shell numbers are integers in floating point: above i + 1/2 counts as i + 1 or more
         for i, value in enumerate(values[1:]):
-            if isinstance(self.shell_number, Expr):
+            if is_expression(self.shell_number):
                 value_at_place = ufl.conditional(
                     ufl.gt(self.shell_number, i + 0.5), value, value_at_place
                 )
@@ -419,66 +428,3 @@ def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar,
 def work(S: Components, T: Tensor) -> Scalar:
     """Return S:T of a stress or a moment S, with indices up, on a strain T."""
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
-
-
-def elastic_density(
-    density: Density,
-    law: Law,
-    thickness: Parameter | None = None,
-    cell_materials: Parameter | None = None,
-) -> Density:
-    """Return a density whose law is made of parameters, from one that takes a keyword `law`.
-
-    The numbers of the law are appended to the density's parameters, then the fields. So other
-    numbers need no new kernel. On interior edges the given density takes a pair of laws.
-
-    Parameters
-    ----------
-    density
-        The density, whose function has the keyword `law`.
-    law
-        The law.
-    thickness
-        Field (1,) that multiplies the thickness; None for 1.
-    cell_materials
-        Field (4,) of `ShellMaterial.numbers` (modulus, nu, density, number of the law); None for
-        one material.
-    """
-
-    def by_side(value: Any) -> Sequence[Any]:
-        """Return a field's values on all sides as a sequence; of one side a bare value is given."""
-        return value if density.sides == 2 else [value]
-
-    def with_law(*arguments: Expr, **keywords: Any) -> Expr:
-        """Return the density's value.
-
-        The arguments are first the density's own, then the numbers of the law, then thickness and
-        materials if there are such fields.
-        """
-        # fields are taken off from the end: the materials on all sides, then the thickness; what is
-        # left ends with the numbers of the law
-        arguments_left, factors, materials = list(arguments), [1] * density.sides, None
-        if cell_materials is not None:
-            materials = by_side(arguments_left.pop())
-        if thickness is not None:
-            factors = [factor[0] for factor in by_side(arguments_left.pop())]
-        count = len(arguments_left) - len(law.numbers)
-        own_arguments, numbers = arguments_left[:count], arguments_left[count:]
-        laws = [law.with_numbers(*numbers).thicker(factor) for factor in factors]  # on each side
-        if materials is not None:
-            # components 0, 1 and 3 are modulus, nu and number of the law; the density is not used
-            laws = [
-                side_law.with_material(material[0], material[1], material[3])
-                for side_law, material in zip(laws, materials, strict=True)
-            ]
-        law_argument = tuple(laws) if density.sides == 2 else laws[0]
-        return density.function(*own_arguments, law=law_argument, **keywords)
-
-    fields = (field for field in (thickness, cell_materials) if field is not None)
-    parameters = (*density.parameters, *law.numbers, *fields)
-    return replace(
-        density,
-        function=with_law,
-        parameters=parameters,
-        reference_parts=("r",) if law.depends_on_place else density.reference_parts,
-    )

@@ -13,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
-from magshell_fenicsx.input.section import Rubberlike
 from magshell_fenicsx.models.shell.laminate import Laminate, Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, LawByShell
-from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.rubber import Rubber
 from magshell_fenicsx.models.shell.spatial_fields import Pattern
 
 
@@ -65,8 +62,8 @@ class Material:
         shells.
     h
         Thickness over R.
-    rubber
-        Numbers of a law of rubber; None without.
+    elastic_law
+        The law without plies; None for Koiter's.
     laminate
         Plies; None without.
     shells
@@ -79,7 +76,7 @@ class Material:
 
     nu: float
     h: float
-    rubber: Rubberlike | None = None
+    elastic_law: Law | None = None
     laminate: Laminate | None = None
     shells: Mapping[str, ShellMaterial] | None = None
     laws: tuple[Law, ...] = ()
@@ -89,20 +86,15 @@ class Material:
     def law(self) -> Law:
         """The law of the material: energies, stresses and moments as functions of strains.
 
-        Several shells have their laws in `laws`; else plies, rubber or Koiter's law hold, in this
-        order. Rubber has constants (mu, alpha) of Ogden's law, or one number of Mooney and Rivlin.
+        Several shells have their laws in `laws`; else plies take the place of `elastic_law`.
         """
         if self.laws:
             if len(self.laws) > 1:
-                return LawByShell(self.h, self.nu, laws=self.laws)
+                return LawByShell(self.h, laws=self.laws)
             return self.laws[0]
         if self.laminate:
             return Laminated.from_laminate(self.laminate, self.h, self.nu)
-        if isinstance(self.rubber, tuple):
-            mu, alpha = self.rubber
-            # the second argument, the number of a law, is not used by Ogden's law
-            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)
-        return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
+        return self.elastic_law or Koiter(self.h, self.nu)
 
     @property
     def laminate_by_shell(self) -> dict[str, Laminate]:

@@ -1,9 +1,8 @@
-"""Incompressible rubber: the energies of a neo-Hookean or Mooney-Rivlin shell at any stretch.
+"""Incompressible rubber: the energies of a shell at any stretch.
 
-The energy per volume is C10 (I1 - 3) + C01 (I2 - 3), E = 6 (C10 + C01). The normal stress is zero
-and the thickness follows from the area (R. W. Ogden, *Non-linear elastic deformations*, 1984): with
-C = a0^-1 a of the surface, t = tr C and d = det C, the stretch of the thickness is d^(-1/2), I1 = t
-+ 1/d and I2 = d + t/d.
+The normal stress is zero and the thickness follows from the area (R. W. Ogden, *Non-linear elastic
+deformations*, 1984): with C = a0^-1 a of the surface, t = tr C and d = det C, the stretch of the
+thickness is d^(-1/2), and the invariants of the body are I1 = t + 1/d and I2 = d + t/d.
 
 A layer at the height z over the middle has the strain E - d^(-1/2) z K, so that the energy of
 bending is
@@ -27,27 +26,33 @@ docs/theory.md, Rubber.
 """
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
-import ufl
-from ufl.core.expr import Expr
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Tensor, lower_index, trace
+from magshell_fenicsx.models.strain_energy import Scalar, StrainEnergy, root
 
-from magshell_fenicsx.models.shell.law import (
-    Components,
-    Koiter,
-    Law,
-    Scalar,
-    Tensor,
-    lower_index,
-    trace,
-)
+
+class BendingForm(NamedTuple):
+    """The energy of bending as a quadratic form in T = a^ij K_ij, tr K and det K.
+
+    Attributes
+    ----------
+    square, mixed, determinant, trace
+        Factors of T^2, -T tr K, -det K and (tr K)^2 in twice the energy, over E h.
+    """
+
+    square: Scalar
+    mixed: Scalar
+    determinant: Scalar
+    trace: Scalar
 
 
 class Incompressible(Law):
     """A law of rubber: stress, moments and energy of bending, from three functions of a subclass.
 
-    These are the energy of stretching (`membrane`), its slopes by T and D (`_slopes`) and the four
-    factors in the energy of bending (`_stiffness`).
+    These are the energy of stretching (`membrane`), its slopes by T and D (`_slopes`) and the form
+    of bending (`_bending_form`).
     """
 
     @property
@@ -56,7 +61,12 @@ class Incompressible(Law):
 
     @property
     def linear(self) -> Koiter:
-        return Koiter(self.h, 0.5, self.thickness_factor, self.modulus_factor)
+        return Koiter(
+            self.h,
+            0.5,
+            thickness_factor=self.thickness_factor,
+            modulus_factor=self.modulus_factor,
+        )
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
         """Return S with indices up, by the energy's slopes in T = tr C - 2 and D = det(C - 1).
@@ -79,28 +89,26 @@ class Incompressible(Law):
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         """Return the energy of bending, a quadratic form in a^ij K_ij, tr K and det K."""
         surface = Stretched(E, up)
-        # factors of T², -T tau, -det K and tau² in twice the energy
-        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
+        form = self._bending_form(surface)
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
         T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
         return (
-            square_factor * T**2 - mixed_factor * T * tau - det_factor * det + trace_factor * tau**2
+            form.square * T**2 - form.mixed * T * tau - form.determinant * det + form.trace * tau**2
         ) / 2
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         """Return M with indices up, the derivative of `bending` by K."""
         surface = Stretched(E, up)
-        # factors of T², -T tau, -det K and tau² in twice the energy
-        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
+        form = self._bending_form(surface)
         T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
         # derivatives of the energy by both traces
-        by_T = square_factor * T - mixed_factor / 2 * tau
-        by_tau = trace_factor * tau - mixed_factor / 2 * T
+        by_T = form.square * T - form.mixed / 2 * tau
+        by_tau = form.trace * tau - form.mixed / 2 * T
         # components 11, 12, 22: derivatives of tau and of det K by K
         a = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         adjugate = (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
         M11, M12, M22 = (
-            by_T * deformed_up + by_tau * metric_up - det_factor / 2 * curvature_cofactor
+            by_T * deformed_up + by_tau * metric_up - form.determinant / 2 * curvature_cofactor
             for deformed_up, metric_up, curvature_cofactor in zip(
                 surface.inverse, a, adjugate, strict=True
             )
@@ -130,15 +138,12 @@ class Incompressible(Law):
         The determinant of c (x) c is zero, so that its factor is not needed.
         """
         surface = Stretched(E, up)
-        # factors of T², -T tau and tau² in twice the energy
-        square_factor, mixed_factor, _, trace_factor = self._stiffness(surface)
+        form = self._bending_form(surface)
         (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
         # the deformed trace of c (x) c; the undeformed one is the square of c
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return (
-            square_factor * T**2
-            - mixed_factor * T * covector_square
-            + trace_factor * covector_square**2
+            form.square * T**2 - form.mixed * T * covector_square + form.trace * covector_square**2
         )
 
     @abstractmethod
@@ -149,63 +154,85 @@ class Incompressible(Law):
         """
 
     @abstractmethod
-    def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return the factors in twice the energy of bending, over E h per undeformed area.
-
-        They belong to T^2, -T tr K, -det K and (tr K)^2, in this order. Here T = a^ij K_ij with the
-        deformed inverse metric a^ij.
-        """
+    def _bending_form(self, surface: "Stretched") -> BendingForm:
+        """Return the energy of bending at the stretch of a surface; it is positive for every K."""
 
 
 @dataclass(frozen=True)
 class Rubber(Incompressible):
-    """The law of Mooney and Rivlin; its parameter is C01/(C10 + C01), 0 for neo-Hooke."""
+    """The law of rubber whose energy is a function of the invariants I1 and I2.
+
+    Attributes
+    ----------
+    energy
+        The energy per volume.
+    """
+
+    energy: StrainEnergy
+
+    @property
+    def numbers(self) -> tuple[Any, ...]:
+        return self.h, *self.energy.constants
+
+    def with_numbers(self, *numbers: Any) -> Self:
+        h, *constants = numbers
+        return type(self)(h, replace(self.energy, constants=tuple(constants)))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        """Return ((1 - s)(I1 - 3) + s (I2 - 3))/6 with s = C01/(C10 + C01), the law's parameter.
-
-        It is multiplied by the factors of modulus and thickness.
-        """
         surface = Stretched(E, up)
-        return (
-            self.modulus_factor
-            * self.thickness_factor
-            / 6
-            * ((1 - self.parameter) * surface.first + self.parameter * surface.second)
-        )
+        energy = self.energy.value(surface.first, surface.second)
+        return self.modulus_factor * self.thickness_factor * energy
 
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
-        """Return the derivatives by T and D of ((1 - s)(I1 - 3) + s (I2 - 3))/6.
+        """Return the derivatives by T and D of the energy, by the chain rule.
 
-        The slopes of I1 and I2 are found times d = 1 + T + D, which is divided out at the end.
+        The derivatives of I1 and I2 are found times d = 1 + T + D, which is divided out at the end.
         """
-        # pairs: times d the derivatives by T and D of I1, then of I2
-        first_slopes = 2 * surface.T + surface.D - surface.first, surface.T - 1 - surface.first
-        second_slopes = (
-            2 * (surface.d - 1) - surface.second,
-            2 * (surface.d - 1) - 1 - surface.second,
+        T, D, d = surface.T, surface.D, surface.d
+        energy = self.energy.derivatives(surface.first, surface.second)
+        first_by_T, first_by_D = 2 * T + D - surface.first, T - 1 - surface.first
+        second_by_T = 2 * (d - 1) - surface.second
+        second_by_D = second_by_T - 1
+        return (
+            (energy.first * first_by_T + energy.second * second_by_T) / d,
+            (energy.first * first_by_D + energy.second * second_by_D) / d,
         )
-        by_T, by_D = (
-            ((1 - self.parameter) * first_slope + self.parameter * second_slope) / (6 * surface.d)
-            for first_slope, second_slope in zip(first_slopes, second_slopes, strict=True)
-        )
-        return by_T, by_D
 
-    def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return factors of T², -T tr K, -det K and (tr K)² in twice the energy of bending.
+    def _bending_form(self, surface: "Stretched") -> BendingForm:
+        """Return the form of bending from W'' of an energy W of I1 and I2.
+
+        By the chain rule, d K:W'':K/4 is the sum of
+
+        - the derivatives of the energy by I1 and I2, times d K:I1'':K/4 = 2 (T^2 - det K/det a) and
+          d K:I2'':K/4 = 2 (t T^2 - T tr K - (t - d^2) det K/det a), in which sqrt(d) replaces d^2;
+        - its second derivatives, times products of I1':K/2 = tr K - T/d and I2':K/2 = tr K/d + (d -
+          t/d) T.
 
         Here T = a^ij K_ij with the deformed inverse metric a^ij.
         """
-        # h^2/(12 d) of the energy of bending, times 4/6 and 1/d of W''
-        factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
-        first_share, second_share, trace_of_C = 1 - self.parameter, self.parameter, 2 + surface.T
-        # the part of W'' that multiplies det K is changed: W'' itself has d^2 in place of the root
-        det_factor = first_share + second_share * (trace_of_C - root(surface.d))
-        return (
-            factor * 2 * (first_share + second_share * trace_of_C),
-            factor * 2 * second_share,
-            factor * 2 * det_factor * surface.up / surface.d,
-            0,
+        d, trace_of_C = surface.d, 2 + surface.T
+        energy = self.energy.derivatives(surface.first, surface.second)
+        second_derivatives = energy.first_first, energy.first_second, energy.second_second
+
+        def product(left: tuple[Scalar, Scalar], right: tuple[Scalar, Scalar]) -> Scalar:
+            """Return the second derivatives contracted with factors of I1':K/2 and I2':K/2."""
+            first_first, first_second, second_second = second_derivatives
+            return (
+                first_first * left[0] * right[0]
+                + first_second * (left[0] * right[1] + left[1] * right[0])
+                + second_second * left[1] * right[1]
+            )
+
+        # factors of T, then of tr K, in I1':K/2 and I2':K/2
+        of_T, of_trace = (-1 / d, d - trace_of_C / d), (1, 1 / d)
+        # h^2/(12 d) of the energy of bending, times 4/d
+        factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (3 * d**2)
+        det_factor = energy.first + energy.second * (trace_of_C - root(d))
+        return BendingForm(
+            factor * (2 * (energy.first + energy.second * trace_of_C) + d * product(of_T, of_T)),
+            factor * 2 * (energy.second - d * product(of_T, of_trace)),
+            factor * 2 * det_factor * surface.up / d,
+            factor * d * product(of_trace, of_trace),
         )
 
 
@@ -245,8 +272,3 @@ class Stretched:
         """Return a^ij K_ij with the inverse of the deformed metric."""
         a11, a12, a22 = self.inverse
         return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
-
-
-def root(x: Scalar) -> Scalar:
-    """Return the square root of an expression, a number or an array."""
-    return ufl.sqrt(x) if isinstance(x, Expr) else x**0.5

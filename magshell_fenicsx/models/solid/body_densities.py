@@ -1,4 +1,4 @@
-"""Energies of the solid of compressible rubber for which E and nu stand, at points.
+"""Energies of a solid of compressible rubber at points.
 
 Energies are over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is
 the undeformed place, u the displacement and H its gradient by X; F = 1 + H. At an end, the face
@@ -14,6 +14,7 @@ edge's tangent, which has the surface on its left.
 - `unit` is a factor that turns a volume over R³ into the unit of energies.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import ufl
@@ -21,37 +22,35 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.densities import field_at_displacement
+from magshell_fenicsx.models.strain_energy import StrainEnergy
 
 
-def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
-    """mu/2 (J^(-2/3) F:F - 3)/h: the energy of distortion, without that of a change of volume.
+def distortion(
+    X: Expr,
+    u: Expr,
+    H: Expr,
+    shear: Expr,
+    h: Expr,
+    *constants: Expr,
+    energy: Callable[..., Expr],
+    growth: Expr | None = None,
+) -> Expr:
+    """3 mu W(J^(-2/3) I1 - 3, J^(-4/3) I2 - 3)/h: the energy of distortion.
 
-    `shear` is mu over E. With a `growth` G, F G^(-1) takes the place of F, and the energy is times
-    det G.
+    It has no part of a change of volume. W is the `energy` of incompressible rubber over its
+    Young's modulus, 3 mu, a function of the invariants and of `constants`; `shear` is mu over E.
+    With a `growth` G, F G^(-1) takes the place of F, and the energy is times det G.
     """
     F = ufl.Identity(3) + H
     if growth is not None:  # the same density, for H + 1 = F G^(-1)
+        elastic_gradient = ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3)
         return ufl.det(growth) * distortion(
-            X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h
+            X, u, elastic_gradient, shear, h, *constants, energy=energy
         )
-    return shear / (2 * h) * (ufl.det(F) ** (-2 / 3) * ufl.inner(F, F) - 3)
-
-
-def areal_distortion(
-    X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None
-) -> Expr:
-    """mu/2 (J^(-4/3) I2 - 3)/h, with the second invariant I2 of F^T F: the term of Mooney-Rivlin.
-
-    Like `distortion` it has no energy of a change of volume. `shear` is mu over E. With a `growth`
-    G, F G^(-1) takes the place of F, and the energy is times det G.
-    """
-    F = ufl.Identity(3) + H
-    if growth is not None:
-        return ufl.det(growth) * areal_distortion(
-            X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h
-        )
-    C = ufl.dot(F.T, F)
-    return shear / (2 * h) * (ufl.det(F) ** (-4 / 3) * (ufl.tr(C) ** 2 - ufl.inner(C, C)) / 2 - 3)
+    J, C = ufl.det(F), ufl.dot(F.T, F)
+    first = J ** (-2 / 3) * ufl.inner(F, F) - 3
+    second = J ** (-4 / 3) * (ufl.tr(C) ** 2 - ufl.inner(C, C)) / 2 - 3
+    return shear / (2 * h) * (6 * energy(first, second, *constants))
 
 
 def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr, growth: Expr | None = None) -> Expr:
@@ -175,30 +174,38 @@ def turning(
 
 
 @dataclass(frozen=True)
-class MooneyRivlin:
-    """W = mu/2 [(1 - s) (J^(-2/3) I1 - 3) + s (J^(-4/3) I2 - 3)] + kappa/2 (J - 1)^2, moduli over
-    Young's modulus.
+class CompressibleRubber:
+    """Rubber with the energy 3 mu W(J^(-2/3) I1 - 3, J^(-4/3) I2 - 3) + kappa/2 (J - 1)^2.
 
-    s = C01/(C10 + C01) is the `share`; at 0 it is the neo-Hookean law of Zhao et al. (J. Mech.
-    Phys. Solids 124, 2019), whose elements the paper takes.
+    Neo-Hookean, W = (I1 - 3)/6, it is the law of Zhao et al. (J. Mech. Phys. Solids 124, 2019),
+    whose elements the paper takes.
+
+    Attributes
+    ----------
+    energy
+        W, the energy of incompressible rubber over its Young's modulus.
+    shear, bulk
+        mu and kappa, over Young's modulus.
 
     Examples
     --------
-    >>> MooneyRivlin.from_poisson_ratio(0.0, 100.0)
-    MooneyRivlin(shear=0.5, bulk=0.3333333333333333, share=0.0)
-    >>> rubber = MooneyRivlin.from_poisson_ratio(0.5, 100.0)
+    >>> W = StrainEnergy(lambda first, second: first / 6)
+    >>> material = CompressibleRubber.from_poisson_ratio(W, 0.0, 100.0)
+    >>> material.shear, material.bulk
+    (0.5, 0.3333333333333333)
+    >>> rubber = CompressibleRubber.from_poisson_ratio(W, 0.5, 100.0)
     >>> round(rubber.bulk / rubber.shear, 9), round(rubber.youngs_modulus, 5), round(rubber.nu, 5)
     (100.0, 0.99668, 0.49502)
     """
 
+    energy: StrainEnergy
     shear: float
     bulk: float
-    share: float = 0.0
 
     @classmethod
     def from_poisson_ratio(
-        cls, nu: float, bulk_to_shear: float, share: float = 0.0
-    ) -> "MooneyRivlin":
+        cls, energy: StrainEnergy, nu: float, bulk_to_shear: float
+    ) -> "CompressibleRubber":
         """Return the law with Young's modulus 1 and Poisson's ratio `nu` at small strains.
 
         For nu = 0.5 the bulk modulus would be infinite. In its place it is `bulk_to_shear` times
@@ -206,7 +213,7 @@ class MooneyRivlin:
         about 1/(3 bulk_to_shear), and nu less than 1/2 by about 1/(2 bulk_to_shear).
         """
         shear = 1 / (2 * (1 + nu))
-        return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)), share)
+        return cls(energy, shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)))
 
     @property
     def youngs_modulus(self) -> float:

@@ -115,7 +115,7 @@ class PressureSection(PathStep):
         if step_start.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
         # a pressure from inside blows up rubber
-        if step_start.context.shell.rubber is not None and course.drive.first < 0:
+        if step_start.context.shell.law_section.incompressible and course.drive.first < 0:
             # E h/R, the size of such pressures, is about 1/h times p_c
             finer = partial(_longer, INFLATION_STEP_FACTOR / step_start.h)
             drive = replace(course.drive, scale=1 / step_start.h)

@@ -213,7 +213,7 @@ def edges_of_inflated_rubber(context: Context) -> list[str]:
     There are none in a solid, and in a shell so thin that the layer counts less than the mesh.
     """
     shell, boundary = context.shell, context.section_of(BoundarySection)
-    if boundary is None or context.solid or getattr(shell, "rubber", None) is None:
+    if boundary is None or context.solid or not shell.law_section.incompressible:
         return []
     is_flat = shell.geometry in FLAT_GEOMETRIES
     inflated = any(_inflates(step.load, is_flat=is_flat) for step in context.steps)

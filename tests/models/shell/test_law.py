@@ -7,21 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ufl
-from ogdens import TRELOAR
 from plies import laminate, ply
+from rubbers import NEO_HOOKEAN, TRELOAR, mooney, stiffening
 
 from magshell_fenicsx.models.shell.laminate import Laminated
 from magshell_fenicsx.models.shell.law import Koiter, Law, work
-from magshell_fenicsx.models.shell.ogden import Ogden
 from magshell_fenicsx.models.shell.rubber import Rubber
+from magshell_fenicsx.parts.laws.ogden import Ogden
 
 COUPLED = Laminated.from_laminate(laminate(ply(20, 3.0, fraction=0.3), ply(-70, 0.7)), 0.05, 0.3)
 LAWS: list[Law] = [
     Koiter(0.05, 0.3),
     Koiter(0.1, 0.5).thicker(1.3),
-    Rubber(0.05, 0.0),
-    Rubber(0.1, 0.3).thicker(1.3),
-    Ogden(0.1, 0.0, mu=TRELOAR[0], alpha=TRELOAR[1]).thicker(1.3),
+    Rubber(0.05, NEO_HOOKEAN),
+    Rubber(0.1, mooney(0.3)).thicker(1.3),
+    Rubber(0.1, stiffening(5.0, 0.3)).thicker(1.3),
+    Ogden(0.1, TRELOAR[0], alpha=TRELOAR[1]).thicker(1.3),
     replace(COUPLED, direction=(0.3, -0.8)).thicker(1.3),
 ]
 RNG, STEP = np.random.default_rng(4), 1e-30

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from rubbers import mooney
 from scipy.optimize import brentq, minimize_scalar
 
 from magshell_fenicsx import Case
@@ -39,7 +40,7 @@ def block(s: float, share: float) -> Energy:
 
 def sheet(s: float, share: float) -> Energy:
     """The same of a shell: of the stretch of its mid-surface that has the least energy."""
-    law, up = Rubber(H, share), np.eye(2)
+    law, up = Rubber(H, mooney(share)), np.eye(2)
 
     def energy(C: float) -> float:
         def of(stretch: float) -> float:

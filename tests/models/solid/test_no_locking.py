@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bodies import plate
+from rubbers import NEO_HOOKEAN
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 from magshell_fenicsx.shells.solid_terms import QUADRATURE_DEGREE, SolidTerm, TermFactory
@@ -25,7 +26,7 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
 
     With `whole`, compression takes all 27 quadrature points.
     """
-    material = MooneyRivlin.from_poisson_ratio(0.5, bulk_to_shear)
+    material = CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.5, bulk_to_shear)
     loads = Loads(pressure=True)
     model = SolidModel(plate(0.3, H, half=True), Material(0.5, H), material, CONDITIONS, loads)  # type: ignore[arg-type]
     system = model.system

@@ -5,6 +5,7 @@ Newton finds it.
 import numpy as np
 from dolfinx import fem, mesh
 from mpi4py import MPI
+from rubbers import NEO_HOOKEAN
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
@@ -12,7 +13,7 @@ from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.shapes import StripShape, plane_embedding
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.solid import SolidModel
 
@@ -22,7 +23,11 @@ def test_uniform_deformation() -> None:
     patch = triangulate(StripShape(0.8, False), lambda x: 0.25, {}, plane_embedding)
     body = sweep(patch, 0.3, 2, MPI.COMM_SELF)
     model = SolidModel(
-        body, Material(0.5, 0.3), MooneyRivlin.from_poisson_ratio(0.5, 100.0), {}, Loads()
+        body,
+        Material(0.5, 0.3),
+        CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.5, 100.0),
+        {},
+        Loads(),
     )
     V = model.V
     outside = fem.locate_dofs_topological(V, 2, mesh.exterior_facet_indices(body.mesh.topology))

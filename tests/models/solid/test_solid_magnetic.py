@@ -9,13 +9,14 @@ import pytest
 import scipy.linalg
 from along import along, csr, difference
 from bodies import hemisphere, plate
+from rubbers import NEO_HOOKEAN
 from test_solid_derivatives import FIELD, MU, displacement
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.spatial_fields import radial
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation, RemanenceLaw
 from magshell_fenicsx.shells.solid import SolidModel
@@ -24,7 +25,7 @@ H = 0.1
 G = FIELD.gradient
 assert G is not None
 LINEAR = [f"{b} + {g[0]}*x + {g[1]}*y + {g[2]}*z" for b, g in zip(FIELD.applied, G, strict=True)]
-MATERIAL, NEO_HOOKEAN = Material(0.5, H), MooneyRivlin.from_poisson_ratio(0.5, 100.0)
+MATERIAL, SOLID = Material(0.5, H), CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.5, 100.0)
 BR, BA = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8])
 THIN = 1.1**-0.5
 DEFORMATIONS = {
@@ -43,7 +44,7 @@ def formulas(texts: list[str]) -> FormulasInSpace:
 
 def block(law: RemanenceLaw) -> SolidModel:
     return SolidModel(
-        plate(0.8, H), MATERIAL, NEO_HOOKEAN, {}, Loads(magnetic=Magnetisation(BR, BA, law=law))
+        plate(0.8, H), MATERIAL, SOLID, {}, Loads(magnetic=Magnetisation(BR, BA, law=law))
     )
 
 
@@ -104,7 +105,7 @@ def test_tangent_and_residual() -> None:
     model = SolidModel(
         body,
         MATERIAL,
-        NEO_HOOKEAN,
+        SOLID,
         {"rim": "clamped", "symmetry": "symmetry"},
         Loads(magnetic=field),
     )
@@ -135,9 +136,7 @@ def test_field_known_by_values(law: RemanenceLaw) -> None:
     known = replace(FIELD, law=law, across=(), gradient=None, in_space=formulas(LINEAR))
     body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=())
     here, there = (
-        SolidModel(
-            body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, Loads(magnetic=field)
-        ).system
+        SolidModel(body, MATERIAL, SOLID, {"symmetry": "symmetry"}, Loads(magnetic=field)).system
         for field in (known, built_in)
     )
     u = here.zero_at_supports(2e-3 * np.random.default_rng(0).standard_normal(here.size))
@@ -153,7 +152,7 @@ def test_field_known_by_values(law: RemanenceLaw) -> None:
     ]
     assert abs(K[0] - K[1]).max() <= 1e-10 * abs(K[1]).max()
     wild = Loads(magnetic=replace(known, in_space=formulas(["x*exp(y)", "z**2*y", "1/(2 + x*z)"])))
-    model = SolidModel(body, MATERIAL, NEO_HOOKEAN, {}, wild)
+    model = SolidModel(body, MATERIAL, SOLID, {}, wild)
     magnetic = next(t for t in model.system.terms if t.name == "magnetic")
     system, e = (
         FiniteElementSystem(model.u, [magnetic], [], model._pattern, 1.0, model.system._assembler),

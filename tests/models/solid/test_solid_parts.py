@@ -10,6 +10,7 @@ import ufl
 from bodies import body_of
 from conftest import CASES
 from dolfinx import fem
+from rubbers import NEO_HOOKEAN
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.factor import Factorisation
@@ -24,7 +25,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     PointForce,
 )
-from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel
@@ -111,7 +112,7 @@ def test_loads_add_up_to_their_resultants(load: Any) -> None:
     model = SolidModel(
         body,
         Material(0.3, H),
-        MooneyRivlin.from_poisson_ratio(0.3, 100.0),
+        CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.3, 100.0),
         {},
         Loads(dead={"load": (load,)}),
     )
@@ -127,7 +128,11 @@ def test_a_moment_turns_the_end_about_its_edge() -> None:
     body = body_of(STRIP, 0.2, layers=2)
     moment = Loads(dead={"load": (EdgeMoment("right", 3.0),)})
     model = SolidModel(
-        body, Material(0.3, H), MooneyRivlin.from_poisson_ratio(0.3, 100.0), {}, moment
+        body,
+        Material(0.3, H),
+        CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.3, 100.0),
+        {},
+        moment,
     )
     X = model.r0.x.array.reshape(-1, 3)
     assert resultant(model, np.cross([0.0, 1.0, 0.0], X)) == pytest.approx(3.0 * WIDTH, rel=1e-9)
@@ -279,7 +284,7 @@ def test_layers_pull_a_strip_crooked() -> None:
     model = SolidModel(
         body,
         Material(0.0, H),
-        MooneyRivlin.from_poisson_ratio(0.0, 100.0),
+        CompressibleRubber.from_poisson_ratio(NEO_HOOKEAN, 0.0, 100.0),
         {"left": "clamped"},
         Loads(magnetic=field),
     )

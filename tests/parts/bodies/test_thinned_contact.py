@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from along import check, difference
 from conftest import disc, hemisphere, random_displacement
+from rubbers import NEO_HOOKEAN, mooney
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.models.shell.rubber import Rubber
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.plane import Plane
@@ -45,7 +47,11 @@ def test_gap_of_a_stretched_disc() -> None:
     )
     for grown, factor in ((None, 1 / 1.8), (natural, 1.1**3 / 1.8)):
         model = ShellModel(
-            disc(0.8), Material(0.5, H, 0.0), 2, {}, Loads(contacts=(plane,), natural=grown)
+            disc(0.8),
+            Material(0.5, H, Rubber(H, NEO_HOOKEAN)),
+            2,
+            {},
+            Loads(contacts=(plane,), natural=grown),
         )
         x = model.r0.x.array.reshape(-1, 3)
         u = (x * [0.5, 0.2, 0.0]).ravel()
@@ -65,7 +71,12 @@ def test_residual_and_tangent(kind: str) -> None:
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2) if varied else None
     loads = Loads(contacts=(BALL,), natural=NATURAL if varied else None)
     model = ShellModel(
-        hemisphere(0.5), Material(0.5, H, 0.2), 3, {"rim": "clamped"}, loads, thickness=thickness
+        hemisphere(0.5),
+        Material(0.5, H, Rubber(H, mooney(0.2))),
+        3,
+        {"rim": "clamped"},
+        loads,
+        thickness=thickness,
     )
     mu = {"a_ball": 0.3} | ({"natural_curvature": 0.5, "natural_stretch": 0.6} if varied else {})
     u = random_displacement(model, 1e-3)
@@ -82,7 +93,11 @@ def test_meridian() -> None:
 
     meridian = make_meridian(dome, np.linspace(0, np.pi / 2, 9), (None, "rim"))
     model = MeridianModel(
-        meridian, Material(0.5, H, 0.2), 4, {"rim": "clamped"}, Loads(contacts=(BALL,))
+        meridian,
+        Material(0.5, H, Rubber(H, mooney(0.2))),
+        4,
+        {"rim": "clamped"},
+        Loads(contacts=(BALL,)),
     )
     u = random_displacement(model, 1e-3)
     assert model.system.energies(u, {"a_ball": 0.3})["contact ball"] > 1e-6

@@ -19,17 +19,29 @@ The energy of bending is that of docs/theory.md, Rubber.
   subtracted.
 - K is the change of curvature, whose energy is a quadratic form in a^ij K_ij, tr K and det K.
 - Scalars are numbers, arrays or expressions of UFL.
+
+A section is the part of a case with the law's keys.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Self
+from math import isfinite
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-import ufl
-from ufl.core.expr import Expr
+from pydantic import Field, model_validator
 
-from magshell_fenicsx.models.shell.law import Scalar, Tensor
-from magshell_fenicsx.models.shell.rubber import Incompressible, Stretched, root
+from magshell_fenicsx.models.shell.law import Tensor
+from magshell_fenicsx.models.shell.rubber import BendingForm, Incompressible, Stretched
+from magshell_fenicsx.models.strain_energy import Scalar, is_expression, root
+from magshell_fenicsx.parts.laws.law_section import LawSection
+from magshell_fenicsx.platform.lazy_import import lazy_import
+
+if TYPE_CHECKING:
+    import ufl
+else:
+    ufl = lazy_import("ufl")
+
+Exponent = Annotated[float, Field(ge=-20, le=20)]
 
 SERIES_LIMIT, SERIES_TERMS = (
     0.02,
@@ -39,7 +51,7 @@ SERIES_LIMIT, SERIES_TERMS = (
 
 @dataclass(frozen=True)
 class Ogden(Incompressible):
-    """Ogden's law; its parameter is not used.
+    """Ogden's law.
 
     Attributes
     ----------
@@ -47,16 +59,8 @@ class Ogden(Incompressible):
         Constants of the terms, mu over E: the sum of mu alpha is 2/3, each mu alpha is positive.
     """
 
-    mu: Any = field(default=(), kw_only=True)
-    alpha: tuple[float, ...] = field(default=(), kw_only=True)
-
-    @property
-    def numbers(self) -> tuple[Any, ...]:
-        return self.h, self.parameter, self.mu
-
-    def with_numbers(self, *numbers: Any) -> Self:
-        h, number, mu = numbers
-        return type(self)(h, number, mu=mu, alpha=self.alpha)
+    mu: Any
+    alpha: tuple[float, ...] = field(kw_only=True)
 
     @property
     def terms(self) -> list[tuple[Scalar, float]]:
@@ -99,11 +103,10 @@ class Ogden(Incompressible):
             )
         return by_t + by_d, by_d
 
-    def _stiffness(self, surface: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return factors of T², -T tr K, -det K and (tr K)² in twice the energy of bending.
+    def _bending_form(self, surface: Stretched) -> BendingForm:
+        """Return the form of bending, by second derivatives of the energy of stretching.
 
-        Here T = a^ij K_ij with the deformed inverse metric a^ij. The factors follow from the second
-        derivatives of the energy of stretching by t and d, as derived in docs/theory.md, Rubber.
+        They are those by t and d, as derived in docs/theory.md, Rubber.
         """
         w, softening = _uneven(surface), self.softening
         y = 1 + w
@@ -130,12 +133,50 @@ class Ogden(Incompressible):
         det_factor = 2 * uniaxial**2 / (uniaxial + equibiaxial)
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * surface.d)
         s = root(surface.d)
-        return (
+        return BendingForm(
             factor * square_factor,
             -factor * mixed_factor / s,
             factor * det_factor * surface.up / surface.d,
             factor * trace_factor / surface.d,
         )
+
+
+class OgdenSection(LawSection):
+    """Ogden's rubber, whose energy is a sum of powers of the principal stretches."""
+
+    law: Literal["ogden"]
+    mu: list[float] = Field(min_length=1, max_length=6)
+    """Of law: ogden, of each term of its energy mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3); only
+    their ratios count, for E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
+    alpha: list[Exponent] = Field(min_length=1, max_length=6)
+    """Of law: ogden, the exponent of each term, with the sign of its mu"""
+
+    title: ClassVar[str] = "Ogden"
+    keys_text: ClassVar[str] = "lists, one as long as the other, of law: ogden alone"
+
+    @model_validator(mode="after")
+    def _energy_is_positive(self) -> Self:
+        """Refuse a modulus that does not have the sign of its exponent."""
+        for i, (modulus, exponent) in enumerate(zip(self.mu, self.alpha, strict=True)):
+            if not (isfinite(modulus) and modulus * exponent > 0):
+                raise ValueError(
+                    f"mu.{i}: {modulus:g}: mu alpha must be positive; here alpha is {exponent:g}"
+                )
+        return self
+
+    def elastic_law(self, h: float, nu: float) -> Ogden:
+        return Ogden(h, self._mu_over_E, alpha=tuple(self.alpha))
+
+    @property
+    def numbers_text(self) -> str:
+        terms = zip(self._mu_over_E, self.alpha, strict=True)
+        terms_text = ", ".join(f"{mu:.5g} and {alpha:g}" for mu, alpha in terms)
+        return f"mu/E and alpha: {terms_text}"
+
+    @property
+    def _mu_over_E(self) -> tuple[float, ...]:
+        modulus = 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
+        return tuple(mu / modulus for mu in self.mu)
 
 
 def _uneven(surface: Stretched) -> Scalar:
@@ -165,7 +206,7 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
         series.append(_horner([float(coefficient) for coefficient in derivative], w))
     if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
         return series[0], series[1], series[2]
-    in_series = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
+    in_series = ufl.lt(w, SERIES_LIMIT) if is_expression(w) else np.real(w) < SERIES_LIMIT
     # in the series' range the other branch is evaluated too: it must not divide by zero
     bounded_w = _conditional(in_series, SERIES_LIMIT, w)
     # V and its derivatives by p = exp(a u), where cosh u = y
@@ -190,6 +231,6 @@ def _horner(c: list[float], w: Scalar) -> Scalar:
 
 
 def _conditional(condition: Any, if_true: Scalar, if_false: Scalar) -> Scalar:
-    if isinstance(condition, Expr):
+    if is_expression(condition):
         return ufl.conditional(condition, if_true, if_false)
     return np.where(condition, if_true, if_false)

@@ -1,0 +1,1 @@
+"""The laws of a shell's material: a file each, with its keys and its energy."""

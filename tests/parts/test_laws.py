@@ -1,0 +1,150 @@
+"""A law of the material is one file and one name: Gent's rubber, in a copy of the package.
+
+A sphere is blown up by p = 2 (h/R) W'(l)/l^2 with W' the slope of the energy by the stretch l. For
+Gent's rubber this is 4 W_1 (1/l - 1/l^7), W_1 = J_m/(6 (J_m + 3 - I1)), I1 = 2 l^2 + 1/l^4.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+import magshell_fenicsx
+
+PACKAGE, LAW = Path(magshell_fenicsx.__file__).parent, Path(__file__).parents[1] / "gent.py"
+JM, R_OVER_H = 3.0, 100
+SPHERE = {
+    "shell": {
+        "geometry": "hemisphere",
+        "radius_to_thickness": R_OVER_H,
+        "poisson_ratio": 0.5,
+        "law": "gent",
+        "jm": JM,
+    },
+    "points": {"top": [0, 0, 1]},
+    "boundary": {"equator": "symmetry", "top": {"held": ["x", "y"]}},
+    "loading": {
+        "kind": "pressure",
+        "control": "volume",
+        "until": "target",
+        "volume_change": 2.5,
+        "points": 2,
+    },
+    "mesh": {"refinement": 0.5},
+}
+RUN = """
+import json, sys
+import magshell_fenicsx as ms
+for case in json.loads(sys.stdin.read()):
+    rows = ms.run(case).rows
+    print(json.dumps([[float(row["w_pole_over_h"]), float(row["p_over_pc"])] for row in rows]))
+"""
+GRADIENT = """
+import json, sys
+import magshell_fenicsx as ms
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.gradients.gradient import gradient
+scene = ms.Scene(json.loads(sys.stdin.read()))
+fold = next(record for record in follow(scene) if record.label == "fold")
+slope = gradient(scene, fold, of="instability", by="shell.jm")["shell.jm"]
+print(json.dumps([fold.point.state.mu["pressure"], slope]))
+"""
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables of a process that imports the package with one more law."""
+    folder = tmp_path_factory.mktemp("copy")
+    package = folder / PACKAGE.name
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(LAW, package / "parts" / "laws")
+    kinds = package / "parts" / "kinds.py"
+    registry = kinds.read_text(encoding="utf-8")
+    assert registry.count('"ogden")') == 1
+    kinds.write_text(registry.replace('"ogden")', '"ogden", "gent")'), encoding="utf-8")
+    path = os.pathsep.join([str(folder), *sys.path])
+    return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+
+
+def printed(words: list[str], environment: dict[str, str], text: str = "") -> str:
+    """What a Python process prints, both streams together, for a text that it reads."""
+    return subprocess.run(
+        [sys.executable, *words],
+        input=text,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+        check=False,
+    ).stdout
+
+
+def test_what_check_and_schema_say(environment: dict[str, str], tmp_path: Path) -> None:
+    """Of the law with its number, and of its number without the law."""
+    case, other = tmp_path / "sphere.yaml", {**SPHERE["shell"], "law": "koiter"}  # type: ignore[dict-item]
+    case.write_text(json.dumps(SPHERE), encoding="utf-8")
+    magshell = ["-m", "magshell_fenicsx"]
+    check = printed([*magshell, "check", str(case)], environment)
+    assert "incompressible rubber at any stretch (Gent, J_m = 3)" in check
+    case.write_text(json.dumps({**SPHERE, "shell": other}), encoding="utf-8")
+    refused = printed([*magshell, "check", str(case)], environment)
+    assert "jm: J_m belongs to law: gent, and only to it; here the law is koiter" in refused
+    shells = {
+        name: {
+            "shell": shell,
+            "boundary": SPHERE["boundary"],
+            "points": SPHERE["points"],
+            "place": place,
+        }
+        for name, shell, place in (
+            ("stiffening", SPHERE["shell"], {}),
+            ("linear", {**other, "jm": None}, {"position": [4, 0, 0]}),
+        )
+    }
+    case.write_text(json.dumps({"shells": shells, "loading": SPHERE["loading"]}), encoding="utf-8")
+    assert "each of its own law: gent, koiter" in printed(
+        [*magshell, "check", str(case)], environment
+    )
+    reference = printed([*magshell, "schema", "--markdown"], environment)
+    assert "- `jm`: J_m of law: gent, the value of I1 - 3 that no stretch reaches." in reference
+
+
+def sphere_pressure(stretch: Any, jm: float) -> Any:
+    """The pressure from inside over E h/R."""
+    first = 2 * stretch**2 + stretch**-4.0 - 3
+    return 2 / 3 * jm / (jm - first) * (1 / stretch - stretch**-7.0)
+
+
+@pytest.mark.slow
+def test_a_sphere_in_every_model(environment: dict[str, str]) -> None:
+    """On a meridian and a half to the order (h/R)^2; in three dimensions to that of h/R and of the
+    compressibility.
+    """
+    half = {**SPHERE, "symmetry": "half", "mesh": {"degree": 3, "refinement": 0.3}}
+    solid = {**SPHERE, "model": "solid", "mesh": {"refinement": 0.3}}
+    cases: list[dict[str, Any]] = [SPHERE, half, solid]
+    lines = printed(["-c", RUN], environment, json.dumps(cases)).splitlines()
+    paths = [np.array(json.loads(line)) for line in lines if line.startswith("[[")]
+    for path, tolerance in zip(paths, (1e-3, 1e-3, 0.03), strict=True):
+        stretch, pressure = 1 - path[1:, 0] / R_OVER_H, -path[1:, 1] * 4 / 3 / R_OVER_H
+        assert stretch[-1] > 1.25
+        assert pressure == pytest.approx(sphere_pressure(stretch, JM), rel=tolerance)
+
+
+@pytest.mark.slow
+def test_slope_by_the_number_of_the_law(environment: dict[str, str]) -> None:
+    """The largest pressure of a sphere has the slope of the pressure at its stretch, as there dp =
+    0.
+    """
+    limit = {**SPHERE, "shell": {**SPHERE["shell"], "jm": 30.0}}  # type: ignore[dict-item]
+    pressure, slope = json.loads(printed(["-c", GRADIENT], environment, json.dumps(limit)))
+    stretch = minimize_scalar(lambda x: -sphere_pressure(x, 30.0), bounds=(1.2, 1.8)).x
+    known = (sphere_pressure(stretch, 30.01) - sphere_pressure(stretch, 29.99)) / 0.02
+    assert slope / pressure == pytest.approx(known / sphere_pressure(stretch, 30.0), rel=1e-3)
