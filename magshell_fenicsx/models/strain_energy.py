@@ -9,6 +9,7 @@ A scalar is a number, an array or an expression of UFL. `ln` and `root` take all
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -63,10 +64,9 @@ class StrainEnergy:
         Those of an expression are found by UFL, those of numbers and arrays by Taylor arithmetic.
         """
         if is_expression(first):
-            x, y = ufl.variable(first), ufl.variable(second)
-            by_x, by_y = (ufl.diff(self.value(x, y), invariant) for invariant in (x, y))
-            orders = by_x, by_y, ufl.diff(by_x, x), ufl.diff(by_x, y), ufl.diff(by_y, y)
-            return EnergyDerivatives(*map(ufl.algorithms.expand_derivatives, orders))
+            symbols, derivatives = _symbolic_derivatives(self.function, len(self.constants))
+            values = dict(zip(symbols, (first, second, *self.constants), strict=True))
+            return EnergyDerivatives._make(ufl.replace(each, values) for each in derivatives)
         places = np.stack([np.ravel(first), np.ravel(second), np.zeros(np.size(first))], axis=-1)
         x, y, _ = Taylor.coordinates(places)
         energy, shape = self.value(x, y), np.shape(first)
@@ -75,6 +75,31 @@ class StrainEnergy:
             for tensor in (energy.gradient, energy.hessian)
         )
         return EnergyDerivatives(*gradient[:2], hessian[0, 0], hessian[0, 1], hessian[1, 1])
+
+
+@cache
+def _symbolic_derivatives(
+    function: Callable[..., Scalar], count: int
+) -> tuple[list[Scalar], list[Scalar]]:
+    """Return symbols, and the derivatives of an energy as expressions of these.
+
+    Parameters
+    ----------
+    function, count
+        The energy, and the number of its constants.
+
+    Returns
+    -------
+    symbols
+        They stand for I1 - 3, I2 - 3 and the constants.
+    derivatives
+        In the order of `EnergyDerivatives`.
+    """
+    symbols = [ufl.variable(ufl.as_ufl(1.0)) for _ in range(2 + count)]
+    x, y = symbols[:2]
+    by_x, by_y = (ufl.diff(function(*symbols), invariant) for invariant in (x, y))
+    derivatives = by_x, by_y, ufl.diff(by_x, x), ufl.diff(by_x, y), ufl.diff(by_y, y)
+    return symbols, [ufl.algorithms.expand_derivatives(each) for each in derivatives]
 
 
 def is_expression(x: Scalar) -> bool:

@@ -20,14 +20,15 @@ import magshell_fenicsx
 
 PACKAGE, LAW = Path(magshell_fenicsx.__file__).parent, Path(__file__).parents[1] / "gent.py"
 JM, R_OVER_H = 3.0, 100
-SPHERE = {
-    "shell": {
-        "geometry": "hemisphere",
-        "radius_to_thickness": R_OVER_H,
-        "poisson_ratio": 0.5,
-        "law": "gent",
-        "jm": JM,
-    },
+SHELL: dict[str, Any] = {
+    "geometry": "hemisphere",
+    "radius_to_thickness": R_OVER_H,
+    "poisson_ratio": 0.5,
+    "law": "gent",
+    "jm": JM,
+}
+SPHERE: dict[str, Any] = {
+    "shell": SHELL,
     "points": {"top": [0, 0, 1]},
     "boundary": {"equator": "symmetry", "top": {"held": ["x", "y"]}},
     "loading": {
@@ -39,7 +40,15 @@ SPHERE = {
     },
     "mesh": {"refinement": 0.5},
 }
-RUN = """
+COMMANDS = """
+import json, sys
+from typer.testing import CliRunner
+from magshell_fenicsx.cli import app
+for words in json.loads(sys.stdin.read()):
+    result = CliRunner().invoke(app, words, prog_name="magshell")
+    print(json.dumps(result.output + getattr(result, "stderr", "")))
+"""
+RUNS = """
 import json, sys
 import magshell_fenicsx as ms
 for case in json.loads(sys.stdin.read()):
@@ -73,47 +82,41 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
 
 
-def printed(words: list[str], environment: dict[str, str], text: str = "") -> str:
-    """What a Python process prints, both streams together, for a text that it reads."""
-    return subprocess.run(
-        [sys.executable, *words],
-        input=text,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+def printed(program: str, data: Any, environment: dict[str, str]) -> list[Any]:
+    """The data that a Python program prints as lines of JSON, for data that it reads as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        input=json.dumps(data),
+        capture_output=True,
         text=True,
         env=environment,
         check=False,
-    ).stdout
+    )
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith(("[", '"'))]
 
 
 def test_what_check_and_schema_say(environment: dict[str, str], tmp_path: Path) -> None:
-    """Of the law with its number, and of its number without the law."""
-    case, other = tmp_path / "sphere.yaml", {**SPHERE["shell"], "law": "koiter"}  # type: ignore[dict-item]
-    case.write_text(json.dumps(SPHERE), encoding="utf-8")
-    magshell = ["-m", "magshell_fenicsx"]
-    check = printed([*magshell, "check", str(case)], environment)
-    assert "incompressible rubber at any stretch (Gent, J_m = 3)" in check
-    case.write_text(json.dumps({**SPHERE, "shell": other}), encoding="utf-8")
-    refused = printed([*magshell, "check", str(case)], environment)
-    assert "jm: J_m belongs to law: gent, and only to it; here the law is koiter" in refused
+    """Of the law with its number, of its number without the law, and of two laws."""
+    linear = SHELL | {"law": "koiter"}
     shells = {
-        name: {
-            "shell": shell,
-            "boundary": SPHERE["boundary"],
-            "points": SPHERE["points"],
-            "place": place,
-        }
-        for name, shell, place in (
-            ("stiffening", SPHERE["shell"], {}),
-            ("linear", {**other, "jm": None}, {"position": [4, 0, 0]}),
-        )
+        "stiffening": {"shell": SHELL},
+        "linear": {
+            "shell": {key: value for key, value in linear.items() if key != "jm"},
+            "place": {"position": [4, 0, 0]},
+        },
     }
-    case.write_text(json.dumps({"shells": shells, "loading": SPHERE["loading"]}), encoding="utf-8")
-    assert "each of its own law: gent, koiter" in printed(
-        [*magshell, "check", str(case)], environment
-    )
-    reference = printed([*magshell, "schema", "--markdown"], environment)
+    several = {name: keys | {"boundary": {"equator": "clamped"}} for name, keys in shells.items()}
+    cases = [SPHERE, SPHERE | {"shell": linear}, {"shells": several, "loading": SPHERE["loading"]}]
+    commands = [["schema", "--markdown"]]
+    for number, case in enumerate(cases):
+        (file := tmp_path / f"{number}.yaml").write_text(json.dumps(case), encoding="utf-8")
+        commands.append(["check", str(file)])
+    reference, check, refused, check_of_two = printed(COMMANDS, commands, environment)
     assert "- `jm`: J_m of law: gent, the value of I1 - 3 that no stretch reaches." in reference
+    assert "incompressible rubber at any stretch (Gent, J_m = 3)" in check
+    assert "jm: J_m belongs to law: gent, and only to it; here the law is koiter" in refused
+    assert "each of its own law: gent, koiter" in check_of_two
 
 
 def sphere_pressure(stretch: Any, jm: float) -> Any:
@@ -129,9 +132,7 @@ def test_a_sphere_in_every_model(environment: dict[str, str]) -> None:
     """
     half = {**SPHERE, "symmetry": "half", "mesh": {"degree": 3, "refinement": 0.3}}
     solid = {**SPHERE, "model": "solid", "mesh": {"refinement": 0.3}}
-    cases: list[dict[str, Any]] = [SPHERE, half, solid]
-    lines = printed(["-c", RUN], environment, json.dumps(cases)).splitlines()
-    paths = [np.array(json.loads(line)) for line in lines if line.startswith("[[")]
+    paths = [np.array(path) for path in printed(RUNS, [SPHERE, half, solid], environment)]
     for path, tolerance in zip(paths, (1e-3, 1e-3, 0.03), strict=True):
         stretch, pressure = 1 - path[1:, 0] / R_OVER_H, -path[1:, 1] * 4 / 3 / R_OVER_H
         assert stretch[-1] > 1.25
@@ -143,8 +144,8 @@ def test_slope_by_the_number_of_the_law(environment: dict[str, str]) -> None:
     """The largest pressure of a sphere has the slope of the pressure at its stretch, as there dp =
     0.
     """
-    limit = {**SPHERE, "shell": {**SPHERE["shell"], "jm": 30.0}}  # type: ignore[dict-item]
-    pressure, slope = json.loads(printed(["-c", GRADIENT], environment, json.dumps(limit)))
+    case = SPHERE | {"shell": SHELL | {"jm": 30.0}}
+    ((pressure, slope),) = printed(GRADIENT, case, environment)
     stretch = minimize_scalar(lambda x: -sphere_pressure(x, 30.0), bounds=(1.2, 1.8)).x
     known = (sphere_pressure(stretch, 30.01) - sphere_pressure(stretch, 29.99)) / 0.02
     assert slope / pressure == pytest.approx(known / sphere_pressure(stretch, 30.0), rel=1e-3)

@@ -21,7 +21,7 @@ LAWS: list[Law] = [
     Koiter(0.1, 0.5).thicker(1.3),
     Rubber(0.05, NEO_HOOKEAN),
     Rubber(0.1, mooney(0.3)).thicker(1.3),
-    Rubber(0.1, stiffening(5.0, 0.3)).thicker(1.3),
+    Rubber(0.1, stiffening(40.0, 0.3)).thicker(1.3),
     Ogden(0.1, TRELOAR[0], alpha=TRELOAR[1]).thicker(1.3),
     replace(COUPLED, direction=(0.3, -0.8)).thicker(1.3),
 ]

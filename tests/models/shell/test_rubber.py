@@ -11,6 +11,7 @@ from conftest import disc, hemisphere, random_displacement
 from rubbers import NEO_HOOKEAN, mooney, stiffening
 
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.models.shell.law import work
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.rubber import Rubber
 from magshell_fenicsx.models.shell.strains import TangentFrame
@@ -99,7 +100,9 @@ def test_no_bending_is_free(energy: StrainEnergy) -> None:
 
 @pytest.mark.parametrize("energy", RUBBERS)
 def test_small_strains_are_koiters(energy: StrainEnergy) -> None:
-    """The difference from Koiter's energies is of the order of the strain, over two decades."""
+    """The difference from Koiter's stress and bending is of the order of the strain, over two
+    decades; that from the energy too, of which Gent's logarithm has no digits there.
+    """
     law, koiter, K, E1 = (
         Rubber(H, energy),
         Rubber(H, energy).linear,
@@ -107,10 +110,13 @@ def test_small_strains_are_koiters(energy: StrainEnergy) -> None:
         strains(1, 0.3)[0],
     )
     sizes, up = np.array([1e-3, 1e-4, 1e-5]), np.eye(2)
-    for of, known in (
-        (lambda E: law.membrane(E, up), lambda E: koiter.membrane(E, up)),
+    pairs = [
+        (lambda E: work(law.stress(E, up), E1), lambda E: work(koiter.stress(E, up), E1)),
         (lambda E: law.bending(E, K, up), lambda E: koiter.bending(E, K, up)),
-    ):
+    ]
+    if energy.constants[:1] != (LIMIT,):
+        pairs.append((lambda E: law.membrane(E, up), lambda E: koiter.membrane(E, up)))
+    for of, known in pairs:
         off = [abs(of(size * E1) / known(size * E1) - 1) for size in sizes]
         order = np.diff(np.log(off)) / np.diff(np.log(sizes))
         assert order == pytest.approx(1, abs=0.02)
