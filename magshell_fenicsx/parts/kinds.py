@@ -5,7 +5,7 @@ a key, as a pydantic model; its key `kind` chooses the class, of laws the key `l
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, cast, get_args, get_origin
 
 from pydantic import (
     Field,
@@ -47,7 +47,7 @@ def section_of(package: str, kind: str) -> type[Section]:
     # classes that the module itself defines; `isinstance` would import a lazy module
     classes = [member for member in vars(module).values() if issubclass(type(member), type)]
     own_classes = [member for member in classes if member.__module__ == module.__name__]
-    sections = [member for member in own_classes if issubclass(member, Section)]
+    sections: list[type[Section]] = [each for each in own_classes if issubclass(each, Section)]
     # the values of the key's Literal are the kinds of the class: one class has this kind
     (section,) = (
         member for member in sections if kind in get_args(member.model_fields[key].annotation)
@@ -79,7 +79,7 @@ Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 
 
-LAWS: dict[str, type[LawSection]] = {name: section_of("laws", name) for name in REGISTERED["laws"]}
+LAWS = {name: cast("type[LawSection]", section_of("laws", name)) for name in REGISTERED["laws"]}
 SECTION_BY_KEY = {key: section for section in LAWS.values() for key in section.own_keys()}
 LAW_KEYS = tuple(SECTION_BY_KEY)
 
@@ -143,7 +143,9 @@ class LawChoice(Section):
 def _optional_key(section: type[LawSection], key: str) -> tuple[Any, Any]:
     """Return type and default of a law's key where a shell may be without it."""
     field = section.model_fields[key]
-    given = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    given: Any = (
+        Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+    )
     return given | None, Field(default=None, description=meaning(section, key))
 
 
