@@ -134,8 +134,9 @@ class DenseTangent:
         if self._comm.size == 1:
             return rows
         own_rows, ghost_rows = rows[: 3 * self._owned].copy(), rows[3 * self._owned :]
-        own_blocks = own_rows.reshape(self._owned, 3, -1)
-        ghost_blocks = ghost_rows.reshape(self._ghosts, 3, -1)
+        width = 3 * self._count
+        own_blocks = own_rows.reshape(self._owned, 3, width)
+        ghost_blocks = ghost_rows.reshape(self._ghosts, 3, width)
         # each rank gets the global numbers and the rows of those ghosts that it owns
         sent = [(self._ghost_numbers[i], ghost_blocks[i]) for i in self._ghosts_of_ranks]
         for numbers, received_blocks in self._comm.alltoall(sent):

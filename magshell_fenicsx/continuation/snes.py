@@ -397,9 +397,7 @@ class SnesCallbacks:
                 return step
         # a new matrix of this iterate; at the first one factors of a near state may serve
         is_own = bool(steps) or not self._tangent.is_near(state, self._reuse_distance)
-        factors = self._tangent.latest
-        if is_own:
-            factors = self._tangent.factor_at(state, self._stress)
+        factors = self._tangent.factor_at(state, self._stress) if is_own else self._tangent.latest
         matrix = BorderedMatrix(self._system, factors, state, self._name, self._row)
         step = matrix.solve(*f)
         self.matrix = matrix
