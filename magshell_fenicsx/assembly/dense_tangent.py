@@ -26,13 +26,13 @@ Array = NDArray[np.float64]
 class DenseTerm(Term, Protocol):
     """A term whose tangent couples all unknowns."""
 
-    def hessian(self) -> Array:
-        """Return this rank's part of d2Pi/du2, without supports. Collective.
+    def add_hessian(self, rows: Array, factor: float) -> None:
+        """Add factor d2Pi/du2, this rank's part and without supports, to a matrix. Collective.
 
-        Returns
-        -------
-        Array
-            (3 local nodes, 3 all nodes), rows of ghosts after own ones; it is not to be changed.
+        Parameters
+        ----------
+        rows
+            (3 local nodes, 3 all nodes), rows of ghosts after own ones.
         """
 
 
@@ -89,17 +89,13 @@ class DenseTangent:
         factors
             Term name -> factor of its tangent.
         """
-        weighted_rows = self._weighted_rows(factors)
-        if not weighted_rows:
+        if not any(factors.get(t.name, 0.0) for t in self._terms):
             return K
         n, first_column, (own_fixed, all_fixed) = 3 * self._owned, 3 * self._first, self._fixed
         # arrays of the entries in own and in other columns, and the matrix of PETSc with both
         self._sum = inner, outer, matrix = self._sum or self._create_sum()
         # on one rank the rows are the matrix's own memory
-        rows = inner if self._comm.size == 1 else np.empty((n, 3 * self._count))
-        rows[:] = 0.0
-        for factor, rows_of_term in weighted_rows:
-            rows += factor * rows_of_term
+        rows = self.rows(factors, inner if self._comm.size == 1 else None)
         rows[own_fixed], rows[:, all_fixed] = 0.0, 0.0
         # the sparse matrix is added last: at supports it has the identity
         starts, columns, values = K.getValuesCSR()
@@ -124,17 +120,33 @@ class DenseTangent:
         """
         n = 3 * self._owned
         all_entries, product = np.concatenate(self._comm.allgather(v[:n])), np.zeros_like(v)
-        for factor, rows_of_term in self._weighted_rows(factors):
-            product[:n] += factor * (rows_of_term @ all_entries)
+        product[:n] = self.rows(factors) @ all_entries
         return product
 
-    def rows(self, term: DenseTerm) -> Array:
-        """Return the rows (own unknowns, all) of a term's tangent, without supports. Collective."""
-        rows = term.hessian()
+    def rows(self, factors: Mapping[str, float], out: Array | None = None) -> Array:
+        """Return the rows of own unknowns of the terms' tangent, without supports. Collective.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
+        out
+            Array for the result, on one rank; None: a new one.
+
+        Returns
+        -------
+        Array
+            (3 own nodes, 3 all nodes).
+        """
+        width = 3 * self._count
+        rows = np.empty((3 * (self._owned + self._ghosts), width)) if out is None else out
+        rows[:] = 0.0
+        for term in self._terms:
+            if factor := factors.get(term.name, 0.0):
+                term.add_hessian(rows, factor)
         if self._comm.size == 1:
             return rows
         own_rows, ghost_rows = rows[: 3 * self._owned].copy(), rows[3 * self._owned :]
-        width = 3 * self._count
         own_blocks = own_rows.reshape(self._owned, 3, width)
         ghost_blocks = ghost_rows.reshape(self._ghosts, 3, width)
         # each rank gets the global numbers and the rows of those ghosts that it owns
@@ -142,11 +154,6 @@ class DenseTangent:
         for numbers, received_blocks in self._comm.alltoall(sent):
             np.add.at(own_blocks, numbers - self._first, received_blocks)
         return own_rows
-
-    def _weighted_rows(self, factors: Mapping[str, float]) -> list[tuple[float, Array]]:
-        """Return pairs of a factor and its term's rows, without those whose factor is zero."""
-        weighted = [(factors.get(t.name, 0.0), t) for t in self._terms]
-        return [(factor, self.rows(t)) for factor, t in weighted if factor]
 
     def _create_sum(self) -> tuple[Array, Array, PETSc.Mat]:
         """Create a matrix of PETSc with all entries. Collective.

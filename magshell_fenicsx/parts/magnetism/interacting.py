@@ -178,15 +178,14 @@ class InteractionTerm:
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add nothing: distant nodes act on each other, and the tangent is dense."""
 
-    def hessian(self) -> Array:
-        """Return this rank's part of the second derivative by u; collective.
+    def add_hessian(self, rows: Array, factor: float) -> None:
+        """Add factor D, this rank's part, to a matrix (3 local nodes, 3 all nodes); collective.
 
-        It is (3 local nodes, 3 all nodes), ghosts included. A term from `antisymmetric` returns the
-        derivative by odd changes, which move the images oppositely.
+        A term from `antisymmetric` adds the derivative by odd changes, which move the images
+        oppositely.
         """
-        if self._even_term:
-            return self._even_term._stiffness().matrix(sign=-1.0)
-        return self._stiffness().matrix(sign=1.0)
+        even_term = self._even_term or self
+        even_term._stiffness().add_to(rows, factor, sign=-1.0 if self._even_term else 1.0)
 
     def _stiffness(self) -> Stiffness:
         """Return the second derivatives by u at the present state; collective.
@@ -305,7 +304,9 @@ class InteractionTerm:
         by the nodes of each cell: the one by a shared node is divided equally among its own cells.
         """
         V, count = self._u.function_space, len(self._cells.own_range)
-        D, v = self.hessian(), global_values(direction).ravel()
+        v = global_values(direction).ravel()
+        D = np.zeros((len(self._u.x.array), len(v)))
+        self.add_hessian(D, 1.0)
         _, gradient = self._evaluated()
         by_nodes = energy * gradient + force * (D @ v)
         nodes = V.dofmap.list[:count]

@@ -160,7 +160,7 @@ class Stiffness:
     ) -> None:
         """Number the blocks and set them to zero; parameters are those of the class."""
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
-        # images have one more set of blocks, so that `matrix` can give it a sign
+        # images have one more set of blocks, so that `add_to` can give it a sign
         sets = min(len(turn), 2)
         numbers = np.arange(sets * shape[0] * shape[1], dtype=np.int32).reshape(sets, *shape)
         self.where = np.concatenate(numbers, axis=1)
@@ -184,16 +184,18 @@ class Stiffness:
             block_numbers = self.where[rows[:, None], columns]  # (k, k)
             self.blocks.reshape(-1, 3, 3)[block_numbers] += blocks_of_cell
 
-    def matrix(self, sign: float) -> Array:
-        """Return the matrix (3 local nodes, 3 all nodes).
+    def add_to(self, matrix: Array, factor: float, sign: float) -> None:
+        """Add a multiple of the second derivatives to a matrix (3 local nodes, 3 all nodes).
 
         Blocks of images are added times `sign`: -1 for displacements that are opposite in images.
         """
-        blocks, *blocks_of_images = self.blocks
-        for blocks_of_image in blocks_of_images:
-            blocks = blocks + sign * blocks_of_image
-        rows, columns, *_ = blocks.shape
-        return blocks.transpose(0, 2, 1, 3).reshape(3 * rows, 3 * columns)
+        rows, columns = self.blocks.shape[1:3]
+        # row by row, so that no second array of this size is needed
+        for i, row in enumerate(matrix.reshape(rows, 3, columns, 3)):
+            blocks, *blocks_of_images = self.blocks[:, i]
+            for blocks_of_image in blocks_of_images:
+                blocks = blocks + sign * blocks_of_image
+            row += factor * blocks.transpose(1, 0, 2)
 
 
 @dataclass(frozen=True)

@@ -286,4 +286,4 @@ def smooth(x: Array, sign: float) -> Array:
 def rows_of(system: Any, state: State, term: Any) -> Array:
     """The interaction's part of the tangent."""
     matrix = DenseTangent(system.u.function_space, [term], system.clamped)
-    return np.asarray(system.at_state(state).evaluate(lambda: matrix.rows(term)))
+    return np.asarray(system.at_state(state).evaluate(lambda: matrix.rows({term.name: 1.0})))
