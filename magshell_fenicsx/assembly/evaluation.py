@@ -8,8 +8,8 @@ The energy is a sum of terms mu_i Pi_i(u); mu_i are amplitudes (load parameters,
 prescribed positions) by name, factors their values. Coordinates are the amplitudes that do not just
 multiply terms: `moving` ones move supports, free parameters p enter the terms, with dPi/dp as
 `slopes`. A lid is a surface that closes a moving edge under a live pressure; the volume that it
-sweeps belongs to the pressure's potential. Dense terms couple all unknowns. Own nodes belong to
-this rank, ghosts to others.
+sweeps belongs to the pressure's potential. Own nodes belong to this
+rank, ghosts to others.
 """
 
 import os
@@ -25,7 +25,6 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
-    CorrectedTangent,
     SkewedTangent,
     Vector,
     WeightedDisplacement,
@@ -135,22 +134,17 @@ class Evaluation:
         """
         return self._system._summed(local)
 
-    def residual(self, *, inexact: bool = False) -> Vector:
+    def residual(self) -> Vector:
         """Return dPi/du at own unknowns, zero at supports. Collective.
 
         Along directions in which oblique supports hold nodes it is u itself, so that u is zero
         there in equilibrium. If the residual is not finite, the names of the terms to blame are put
         into the system's `nan_terms`.
-
-        Parameters
-        ----------
-        inexact
-            Whether forces of dense terms may be extrapolated from earlier states.
         """
         system = self._system_at_state
         factors = system._factors(self._mu)
         if system.noise is None:
-            residual = system._summed(system._gradient(factors, inexact=inexact))
+            residual = system._summed(system._gradient(factors))
             if not system._finite(residual.sum()):
                 system.nan_terms = self._nan_terms(factors)
         else:
@@ -300,9 +294,7 @@ class Evaluation:
         self,
         stress: Sequence[WeightedDisplacement] = (),
         times: Mapping[str, float] | None = None,
-        *,
-        inexact: bool = False,
-    ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
+    ) -> PETSc.Mat | SkewedTangent:
         """Assemble d2Pi/du2 at the state. Collective.
 
         Parameters
@@ -311,8 +303,6 @@ class Evaluation:
             Weighted displacements of own nodes, whose stress replaces that of u.
         times
             Term name -> further factor of its tangent; None: no further factors.
-        inexact
-            Whether dense terms may have the tangent of an earlier state.
         """
         system = self._system
         with system.assembly:
@@ -322,7 +312,7 @@ class Evaluation:
             factors = system._factors(self._mu)
             for name, further_factor in (times or {}).items():
                 factors[name] *= further_factor
-            return system._tangent(factors, local_stress, inexact=inexact)
+            return system._tangent(factors, local_stress)
 
     @property
     def _system_at_state(self) -> "FiniteElementSystem":

@@ -7,17 +7,16 @@ them when a path accepts it. Theory: docs/theory.md, equilibrium and continuatio
 The energy is a sum of terms mu_i Pi_i(u); mu are amplitudes, that is load parameters and numbers
 such as positions of supports, by name. Coordinates are amplitudes that do not just multiply terms:
 they move supports by the displacement E(mu), or are free parameters in the terms. Factors of terms
-are their amplitudes' values. Settings are numbers in the forms that a state sets. Dense terms
-couple all unknowns; inexact ones belong to an earlier state or are extrapolated. A clamped edge has
-a term that holds its normal, which turns by a rotation Q where the support turns. A lid is a
-surface that closes a moving edge under a live pressure. Own nodes belong to this rank, ghosts to
+are their amplitudes' values. Settings are numbers in the forms that a state sets. A clamped
+edge has a term that holds its normal, which turns by a rotation Q where the support turns. A lid is
+a surface that closes a moving edge under a live pressure. Own nodes belong to this rank, ghosts to
 others.
 """
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -28,10 +27,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.dense_tangent import DenseTerm
 from magshell_fenicsx.assembly.evaluation import Evaluation, Noise
 from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter, SettableNumber
-from magshell_fenicsx.assembly.nonlocal_terms import DenseTerms, added_tangents, dense_terms
+from magshell_fenicsx.assembly.nonlocal_terms import added_tangents
 from magshell_fenicsx.assembly.oblique_supports import Constraint, ObliqueSupport, Projection
 from magshell_fenicsx.assembly.prescribed_motion import PrescribedMotion
 from magshell_fenicsx.assembly.terms import (
@@ -45,20 +43,15 @@ from magshell_fenicsx.assembly.terms import (
 from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
-    CorrectedTangent,
     SkewedTangent,
     State,
     Vector,
     WeightedDisplacement,
-    symmetric_part,
 )
 from magshell_fenicsx.platform import compat
 
 # A number that terms depend on, and its value in a state that does not have it.
 Setting: TypeAlias = tuple[SettableNumber, float]
-
-# Largest displacement of a step for differences of the dense terms' forces, over the length.
-DENSE_DIFFERENCE_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -119,8 +112,8 @@ class FiniteElementSystem:
         The supports: Dirichlet conditions, and the projection P of oblique supports, or None.
     parameters, moving, edge_pressure
         Free parameters by name, the motion E(mu), and the live pressure at edges that move.
-    added_tangents, dense_terms
-        The tangents of nonlocal terms, and the terms that couple all unknowns, or None.
+    added_tangents
+        The tangents of terms with entries outside the sparsity pattern.
     assembly, noise
         Stopwatch of the assembly, and artificial rounding errors for tests, or None.
 
@@ -172,7 +165,6 @@ class FiniteElementSystem:
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         # terms outside the sparsity pattern
         self.added_tangents = added_tangents(V, terms, self.clamped)
-        self.dense_terms = dense_terms(V, terms, self.clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
@@ -222,11 +214,6 @@ class FiniteElementSystem:
             system._K = self._K.duplicate()
         return system
 
-    @property
-    def has_dense_terms(self) -> bool:
-        """Whether terms couple all unknowns, whose forces and tangent may be extrapolated."""
-        return self.dense_terms is not None
-
     def at_state(self, state: State) -> Evaluation:
         """Return the evaluation of the system at a state."""
         return Evaluation(self, state.u, state.mu)
@@ -273,16 +260,9 @@ class FiniteElementSystem:
             self.moving.put(local, mu)
         return local
 
-    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        """Return R = dPi/du at own unknowns; if `inexact`, with extrapolated forces. Collective."""
-        return Evaluation(self, u, mu).residual(inexact=inexact)
-
-    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        """Return whether extrapolated forces of dense terms are accurate along du. Collective."""
-        step = self.with_ghosts(du)
-        terms = self.dense_terms.terms if self.dense_terms else ()
-        evaluation = self.at_state(State(u, dict(mu)))
-        return all(evaluation.evaluate(lambda: [t.extrapolation_holds_along(step) for t in terms]))
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        """Return R = dPi/du at own unknowns. Collective."""
+        return Evaluation(self, u, mu).residual()
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """Return dPi/du at all own nodes, with the forces of the supports on the shell. Collective.
@@ -328,9 +308,7 @@ class FiniteElementSystem:
         mu: Amplitudes,
         stress: Sequence[WeightedDisplacement] = (),
         times: Mapping[str, float] | None = None,
-        *,
-        inexact: bool = False,
-    ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
+    ) -> PETSc.Mat | SkewedTangent:
         """Assemble d2Pi/du2, or dR/du where a load has no potential. Collective.
 
         Parameters
@@ -340,10 +318,8 @@ class FiniteElementSystem:
             errors of a guess u change much.
         times
             Term name -> further factor of its tangent; None: no further factors.
-        inexact
-            Whether the dense terms may have the tangent of an earlier state.
         """
-        return Evaluation(self, u, mu).tangent(stress, times, inexact=inexact)
+        return Evaluation(self, u, mu).tangent(stress, times)
 
     def zero_at_supports(self, u: Vector) -> Vector:
         """Return the displacement with zeros at the supports."""
@@ -519,17 +495,13 @@ class FiniteElementSystem:
             product[: self.size] = (K * x).array
         for nonlocal_tangent in self.added_tangents:
             product = product + nonlocal_tangent.times(v, factors)
-        if self.dense_terms:
-            product = product + self.dense_terms.times(v, factors)
         return product
 
     def _tangent(
         self,
         factors: Mapping[str, float],
         stress: Sequence[tuple[float, NDArray[np.float64]]],
-        *,
-        inexact: bool = False,
-    ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
+    ) -> PETSc.Mat | SkewedTangent:
         """Assemble the tangent at the displacement in the forms. Collective.
 
         Parameters
@@ -538,8 +510,6 @@ class FiniteElementSystem:
             Term name -> factor of its tangent.
         stress
             Weighted displacements, with ghosts, whose stress replaces that of u; empty: its own.
-        inexact
-            Whether the dense terms may have the tangent of an earlier state.
         """
         if self._assembler:
             K = self._assembler.tangent(factors, stress)
@@ -548,77 +518,11 @@ class FiniteElementSystem:
         for nonlocal_tangent in self.added_tangents:
             K = nonlocal_tangent.sum(K, factors)
         N = self._skew(factors)  # None if all loads have a potential
-        if self.dense_terms:
-            K = self._corrected(K, self.dense_terms, factors, inexact=inexact)
-            if any((N, self.projection, self.noise)):  # these need all entries of K + D
-                K = symmetric_part(K)
         if self.projection:
             K = self.projection.tangent(K)
         if self.noise:
             self.noise.on_matrix(K)
         return SkewedTangent(K, N) if N else K
-
-    def _corrected(
-        self,
-        K: PETSc.Mat,
-        dense_terms: DenseTerms,
-        factors: Mapping[str, float],
-        *,
-        inexact: bool,
-    ) -> PETSc.Mat | CorrectedTangent:
-        """Return the sparse tangent K corrected by the dense terms. Collective.
-
-        If the correction may belong to an earlier state, it also gets the products that show how
-        far it is from the present one.
-
-        Parameters
-        ----------
-        factors
-            Term name -> factor of its tangent.
-        inexact
-            Whether the dense terms may have the tangent of an earlier state.
-        """
-        corrected = dense_terms.corrected(K, factors, inexact=inexact)
-        if not (isinstance(corrected, CorrectedTangent) and inexact):
-            return corrected
-        # products with the tangent at the present state, from computed and from extrapolated forces
-        dense_factors = {t.name: factors[t.name] for t in dense_terms.terms}
-        return replace(
-            corrected,
-            present_product=self._dense_product(dense_factors, inexact=False),
-            extrapolated_product=self._dense_product(dense_factors, inexact=True),
-        )
-
-    def _dense_product(
-        self, factors: Mapping[str, float], *, inexact: bool
-    ) -> Callable[[Vector], Vector]:
-        """Return a function that multiplies a vector by the dense terms' tangent at the present u.
-
-        The function takes differences of forces and is collective. It may be called later, when the
-        system is at another state.
-
-        Parameters
-        ----------
-        factors
-            Dense term name -> factor of its tangent.
-        inexact
-            Whether the forces are extrapolated.
-        """
-        u_of_tangent = np.array(self.u.x.array)
-
-        def times(v: Vector) -> Vector:
-            """Return the product with v, zero at supports, by a central difference."""
-            step, direction = self.step_along(v, DENSE_DIFFERENCE_STEP), self.with_ghosts(v)
-            # the system's u at this call is restored at the end
-            u_at_call, product = np.array(self.u.x.array), np.zeros(self.size)
-            for sign in (1.0, -1.0):
-                self.u.x.array[:] = u_of_tangent + sign * step * direction
-                gradient = self._gradient(factors, inexact=inexact)  # this rank's part
-                product += sign / (2 * step) * self._summed(gradient)  # the sum of all ranks
-            self.u.x.array[:] = u_at_call
-            return product
-
-        return times
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """Return the skew part of the tangent, of loads without potential; None without such.
@@ -664,8 +568,6 @@ class FiniteElementSystem:
         self,
         factors: Mapping[str, float],
         further: Sequence[tuple[float, Derivative]] = (),
-        *,
-        inexact: bool = False,
     ) -> NDArray[np.float64]:
         """Return this rank's part of the gradient of terms at all local nodes, ghosts included.
 
@@ -675,8 +577,6 @@ class FiniteElementSystem:
             Term name -> factor of its gradient; others are left out.
         further
             Derivatives by free parameters that are added, with their factors.
-        inexact
-            Whether forces of dense terms may be extrapolated.
         """
         with self.assembly:
             b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
@@ -685,11 +585,7 @@ class FiniteElementSystem:
                 self.gradients.add(b, factors)
             weighted = [(factors.get(t.name, 0.0), t) for t in self._terms_with_residual]
             for factor, term in itertools.chain(weighted, further):
-                if not factor:
-                    continue
-                if inexact and isinstance(term, DenseTerm):
-                    term.add_extrapolated_residual(b, factor)
-                else:
+                if factor:
                     term.add_residual(b, factor)
             return b
 

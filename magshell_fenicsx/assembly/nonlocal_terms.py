@@ -4,7 +4,7 @@ The entries of contact couple some further unknowns, and change from state to st
 the sparse matrix has a pattern of its own, with room for entries that are expected soon. This
 pattern and the symbolic factorisation are reused until an entry falls outside. Where a term couples
 all unknowns, its tangent is dense (`assembly.dense_tangent.DenseTangent`). Theory: docs/theory.md,
-contact between shells and interaction of the magnetisation with its own field.
+contact between shells, and parts that act on each other.
 
 An entry of a matrix is a global row, a global column and a value; unknowns are numbered by nodes,
 three each. Room is the pattern of entries that may come. Each rank has the rows of its own
@@ -13,7 +13,6 @@ parameter).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
@@ -25,7 +24,6 @@ from scipy.sparse import coo_array, csr_array
 
 from magshell_fenicsx.assembly.dense_tangent import DenseTangent, DenseTerm
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.continuation.system import CorrectedTangent
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -37,7 +35,7 @@ class AddedTangent(Protocol):
     """The tangents of some terms, times factors: a matrix that is added to the sparse tangent."""
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """Return a sparse matrix plus the tangents of the terms. Collective.
+        """Return a matrix plus the tangents of the terms. Collective.
 
         Parameters
         ----------
@@ -86,7 +84,9 @@ class FieldDifferentiable(Protocol):
 def added_tangents(
     V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
 ) -> list[AddedTangent]:
-    """Return the added tangents of the nonlocal terms in a list of terms. Collective.
+    """Return the added tangents of the nonlocal and the dense terms in a list. Collective.
+
+    The dense ones come last, as their sum has all entries.
 
     Parameters
     ----------
@@ -95,74 +95,12 @@ def added_tangents(
     clamped
         Homogeneous Dirichlet conditions.
     """
-    nonlocal_terms = [t for t in terms if isinstance(t, NonlocalTerm)]
-    return [NonlocalEntries(V, nonlocal_terms, clamped)] if nonlocal_terms else []
-
-
-def dense_terms(
-    V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
-) -> "DenseTerms | None":
-    """Return the terms that couple all unknowns, from a list of terms. Collective.
-
-    Parameters
-    ----------
-    V
-        Space of the displacement.
-    clamped
-        Homogeneous Dirichlet conditions.
-
-    Returns
-    -------
-    The terms with their matrix; None if there are no such terms.
-    """
-    coupling_all = [t for t in terms if isinstance(t, DenseTerm)]
-    return DenseTerms(DenseTangent(V, clamped), coupling_all) if coupling_all else None
-
-
-@dataclass(frozen=True)
-class DenseTerms:
-    """Terms that couple all unknowns: their tangent is a dense correction of the sparse one.
-
-    Attributes
-    ----------
-    matrix
-        The object that computes the correction and its products.
-    terms
-        The terms.
-    """
-
-    matrix: DenseTangent
-    terms: Sequence[DenseTerm]
-
-    def corrected(
-        self, K: PETSc.Mat, factors: Factors, *, inexact: bool
-    ) -> PETSc.Mat | CorrectedTangent:
-        """Return a sparse matrix corrected by the dense terms; K itself if all factors are zero.
-
-        Collective.
-
-        Parameters
-        ----------
-        K
-            The sparse matrix, which is changed.
-        factors
-            Term name -> factor of its tangent.
-        inexact
-            Whether the tangents may be those of an earlier state.
-        """
-        terms = self._weighted(factors)
-        return self.matrix.corrected(K, terms, inexact=inexact) if terms else K
-
-    def times(self, v: Array, factors: Factors) -> Array:
-        """Return this rank's part of the tangents' product with v, both with ghosts. Collective.
-
-        `factors` maps the name of a term to the factor of its tangent.
-        """
-        return self.matrix.times(self._weighted(factors), v)
-
-    def _weighted(self, factors: Factors) -> list[tuple[float, DenseTerm]]:
-        """Return pairs of a factor and its term, without those whose factor is zero."""
-        return [(factor, t) for t in self.terms if (factor := factors.get(t.name, 0.0))]
+    tangents = list[AddedTangent]()
+    if nonlocal_terms := [t for t in terms if isinstance(t, NonlocalTerm)]:
+        tangents.append(NonlocalEntries(V, nonlocal_terms, clamped))
+    if dense_terms := [t for t in terms if isinstance(t, DenseTerm)]:
+        tangents.append(DenseTangent(V, dense_terms, clamped))
+    return tangents
 
 
 @runtime_checkable

@@ -14,6 +14,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.parts.magnetism.interaction import refuse_large
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.columns import sizes_of
@@ -131,6 +132,8 @@ def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
     `patch` is the triangulation; None for a meridian.
     """
     cells, unknowns = _count(problem, patch)
+    if problem.loads.interaction:
+        refuse_large(unknowns)
     refuse_overlap(problem, cells)
     lines = [f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"]
     if patch is None:

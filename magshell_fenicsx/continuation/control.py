@@ -8,13 +8,12 @@ by generalised conjugate residuals.
 
 mu is the one amplitude (load parameter) that varies, q = -dPi/dmu its conjugate: the displacement
 on which it does work. R = dPi/du, K = dR/du, and R_mu is the load vector. A direction is a pair
-(du, dmu). Lengths are displacements in units of the system's length. Parts of a lagged K, from
-terms that couple all unknowns, belong to an earlier state.
+(du, dmu). Lengths are displacements in units of the system's length.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 from math import sqrt
 from typing import Generic, Protocol, TypeVar
@@ -24,9 +23,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import (
-    Amplitudes,
     Direction,
-    InexactSystem,
     State,
     System,
     Vector,
@@ -43,7 +40,6 @@ DIFFERENCE_ACCURACY = 1e-4
 MIN_BROYDEN_DIVISOR = 0.3
 
 V = TypeVar("V")
-Residual = Callable[[Vector, Amplitudes], Vector]
 Gradient = tuple[Vector | None, float]  # dg/du, None where it is zero, and dg/dmu
 
 
@@ -203,8 +199,6 @@ class BorderedMatrix:
         The amplitude mu.
     row
         The last row, whose gradient is (c, d).
-    lagged
-        Whether a small part of K belongs to an earlier state: its solutions need not be accurate.
 
     Attributes
     ----------
@@ -223,15 +217,13 @@ class BorderedMatrix:
         state: State,
         name: str,
         row: ConstraintRow,
-        *,
-        lagged: bool = False,
     ) -> None:
         """Solve for the response to the load, K^-1 R_mu, of which every solution is made."""
-        self.state, self.row, self.lagged, self._mu = state, row, lagged, state.mu[name]
+        self.state, self.row, self._mu = state, row, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        self._load_response = factors.solve(self.column, low_accuracy=lagged)
+        self._load_response = factors.solve(self.column)
         self._schur = derivative_along(self._comm, self._gradient, (-self._load_response, 1.0))
         self._weight = dot(self._comm, self._load_response, self._load_response)
 
@@ -245,15 +237,9 @@ class BorderedMatrix:
         scale = min(displacement_per_mu, 1 / abs(self._mu)) if self._mu else displacement_per_mu
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * scale)
 
-    def solve(self, f: Vector, g: float, *, low_accuracy: bool = False) -> Direction:
-        """Return the solution (du, dmu) of K du + R_mu dmu = f and c . du + d dmu = g. Collective.
-
-        Parameters
-        ----------
-        low_accuracy
-            Whether a relative residual of about 3 % is enough, where K has a dense part.
-        """
-        response = self._factors.solve(f, low_accuracy=low_accuracy)
+    def solve(self, f: Vector, g: float) -> Direction:
+        """Return the (du, dmu) of K du + R_mu dmu = f and c . du + d dmu = g. Collective."""
+        response = self._factors.solve(f)
         # block elimination: what K^-1 f leaves of g, over the Schur complement
         dmu = (g - derivative_along(self._comm, self._gradient, (response, 0.0))) / self._schur
         return response - dmu * self._load_response, dmu
@@ -348,8 +334,6 @@ def refined_tangent(
     state: State,
     load: Vector,
     row: ConstraintRow,
-    *,
-    extrapolating: bool = False,
 ) -> Direction | None:
     """Return the path's tangent at a state from the matrix of a nearby state. Collective.
 
@@ -368,29 +352,12 @@ def refined_tangent(
         R_mu at the state.
     row
         The last row, along which the tangent has length one.
-    extrapolating
-        Whether forces of terms that couple all unknowns may be extrapolated from earlier states.
-        They are computed at states along the tangent until the extrapolation holds there.
 
     Returns
     -------
     The tangent; None if the matrix belongs to a state too far away.
     """
-    refinement = _TangentRefinement(system, matrix, state, load, row)
-    if not extrapolating:
-        return refinement.refined(system.residual, t)
-    assert isinstance(system, InexactSystem)
-    for _ in range(MAX_REFINEMENTS):
-        refined = refinement.refined(partial(system.residual, inexact=True), t)
-        if refined is None:
-            return None
-        if system.extrapolation_holds_along(state.u, state.mu, refined[0]):
-            return refined
-        t = refined
-        # a residual with computed forces at a state along t: from now on the extrapolation uses
-        # them and holds there. The returned product is not used, so any vector serves as R
-        refinement.stiffness(system.residual, t[0], t[0])
-    return None
+    return _TangentRefinement(system, matrix, state, load, row).refined(t)
 
 
 @dataclass(frozen=True)
@@ -415,8 +382,8 @@ class _TangentRefinement:
     load: Vector
     row: ConstraintRow
 
-    def refined(self, residual: Residual, t: Direction) -> Direction | None:
-        """Return the tangent for a residual function, by refinement of an approximation.
+    def refined(self, t: Direction) -> Direction | None:
+        """Return the tangent by refinement of an approximation.
 
         z is the residual of both equations at the present approximation, preconditioned by the
         matrix of the nearby state: it estimates the correction that is left. Each new direction p
@@ -425,8 +392,6 @@ class _TangentRefinement:
 
         Parameters
         ----------
-        residual
-            Returns R at a displacement and amplitudes; its differences replace K.
         t
             The approximation (du, dmu).
 
@@ -435,16 +400,16 @@ class _TangentRefinement:
         The tangent; None if the approximation is too poor.
         """
         comm, gradient = self.system.comm, self.row.gradient(self.state)
-        R = residual(self.state.u, self.state.mu)
+        R = self.system.residual(self.state.u, self.state.mu)
 
         def preconditioned_product(t: Direction, g: float = 0.0) -> Direction:
             """Return the preconditioner times (K du + R_mu dmu, c . du + d dmu - g), t = (du, dmu).
 
             Without g it is the image of a direction, with g = 1 minus the residual z at t.
             """
-            force = self.stiffness(residual, t[0], R) + t[1] * self.load
+            force = self._stiffness_times(t[0], R) + t[1] * self.load
             row_value = derivative_along(comm, gradient, t) - g
-            return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
+            return self.matrix.solve(force, row_value)
 
         z = add_scaled((0.0 * t[0], 0.0), -1.0, preconditioned_product(t, 1.0))
         # earlier directions p with their images q and q . q
@@ -483,7 +448,7 @@ class _TangentRefinement:
             q = add_scaled(q, -component, earlier_q)
         return p, q
 
-    def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
+    def _stiffness_times(self, du: Vector, R: Vector) -> Vector:
         """Return K du by a forward difference of the residual.
 
         Parameters
@@ -495,4 +460,5 @@ class _TangentRefinement:
         if size == 0.0:
             return du
         step = DIFFERENCE_STEP * self.system.length / size
-        return np.asarray((residual(self.state.u + step * du, self.state.mu) - R) / step)
+        changed_residual = self.system.residual(self.state.u + step * du, self.state.mu)
+        return np.asarray((changed_residual - R) / step)

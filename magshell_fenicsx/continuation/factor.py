@@ -4,10 +4,8 @@
 with the factors. `BlockElimination` adds the border of a tangent with further scalar unknowns.
 
 A tangent is a symmetric K, or K with a part more: skewed, K + N with N skew-symmetric, of loads
-without potential; corrected, K + D with D a matrix of all entries, of terms that couple all
-unknowns; bordered, [K C; C^T D], with k further scalar unknowns y after u, on the last rank.
-Inertia is the number of negative pivots of LDL^T, that is of unstable directions. A lagged part of
-K + D belongs to an earlier state.
+without potential; bordered, [K C; C^T D], with k further scalar unknowns y after u, on the last
+rank. Inertia is the number of negative pivots of LDL^T, that is of unstable directions.
 """
 
 import time
@@ -21,18 +19,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.krylov_correction import (
-    LOOSE_TOLERANCE,
-    TOLERANCE,
-    CorrectionSolver,
-    ProductCache,
-    count_crossings,
-    crossings_with_lag,
-)
 from magshell_fenicsx.continuation.system import (
     BorderedTangent,
-    CorrectedTangent,
-    DenseCorrection,
     SkewedTangent,
     Tangent,
     Vector,
@@ -43,8 +31,6 @@ from magshell_fenicsx.continuation.system import (
 PREFIX = "magshell_factor_"
 # PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
-# number of factorisations of all entries after one where the factors of the sparse part failed
-FULL_FACTORISATIONS_AFTER_FAILURE = 8
 # number of positive definite matrices after which CHOLMOD is tried again: a change of the method
 # costs an analysis of the matrix, about as long as its factors
 DEFINITE_BEFORE_CHOLMOD = 2
@@ -52,7 +38,6 @@ DEFINITE_BEFORE_CHOLMOD = 2
 REFUSED = 76
 # a larger residual, relative to the right side, takes a second solve
 REFINEMENT_TOLERANCE = 1e-11
-Array = NDArray[np.float64]
 
 
 class Factorisation:
@@ -62,8 +47,7 @@ class Factorisation:
     no negative pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is
     tried again after `DEFINITE_BEFORE_CHOLMOD` successive matrices in which MUMPS counts none. The
     memory of the other one is released. A skewed tangent K + N takes two factorisations: that of K
-    for the inertia, and LU of the sum for the solutions. Of K + D, in which D couples all unknowns,
-    only K is factored where D is small (`continuation.krylov_correction`).
+    for the inertia, and LU of the sum for the solutions.
 
     Attributes
     ----------
@@ -79,20 +63,12 @@ class Factorisation:
         singular once less often.
     skewed
         Whether that tangent was a skewed one.
-    inertia_uncertainty
-        Where K was factored in place of K + D: the inverse of the largest relative error of D, or
-        of its lagged part, that could not change a sign. Else infinite.
-    inertia_is_known
-        Whether the negative pivots of the latest tangent, and their uncertainty, are known.
 
-    Private fields: of `_cholmod` and `_mumps` one is in use, as `_pc`. `_border`, `_correction` and
-    `_correction_solver` belong to the latest tangent, if it is bordered or corrected: the
-    elimination of the border, D, and the solver with D. `_bordered` and `_corrected` are that
-    tangent. `_products` are the stored products with D. `_full_factorisations_left` counts down the
-    factorisations of all entries after a failure. `_has_cholmod` and `_tries_cholmod` tell whether
-    CHOLMOD can be used and is tried next. `_definite_count` counts successive matrices of MUMPS
-    without a negative pivot, `_entries` the entries of its matrix. `_rhs` and `_solution` are
-    vectors of PETSc.
+    Private fields: of `_cholmod` and `_mumps` one is in use, as `_pc`. `_bordered` is the latest
+    tangent, if it has a border, and `_border` the elimination of that. `_has_cholmod` and
+    `_tries_cholmod` tell whether CHOLMOD can be used and is tried next. `_definite_count` counts
+    successive matrices of MUMPS without a negative pivot, `_entries` the entries of its matrix.
+    `_rhs` and `_solution` are vectors of PETSc.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -110,23 +86,9 @@ class Factorisation:
         self._border: BlockElimination | None = None
         self._bordered: BorderedTangent | None = None
         self.skewed = False
-        self._correction: DenseCorrection | None = None
-        self._products: ProductCache | None = None
-        # of the present K and D, from its first solution on
-        self._correction_solver: CorrectionSolver | None = None
-        # factorisations until the factors of a sparse part are tried again
-        self._full_factorisations_left = 0
-        self.inertia_uncertainty, self.inertia_is_known = np.inf, True
-        self._corrected: CorrectedTangent | None = None
 
-    def factor(self, tangent: Tangent, *, needs_inertia: bool = True) -> None:
+    def factor(self, tangent: Tangent) -> None:
         """Factor a matrix; a bordered one by the factors of its K and k back-solves. Collective.
-
-        Parameters
-        ----------
-        needs_inertia
-            Whether the negative pivots of a corrected matrix are counted now; else
-            `count_corrected_inertia` counts them later.
 
         Raises
         ------
@@ -134,18 +96,12 @@ class Factorisation:
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other
             than the matrix.
         """
-        # the tangent without its border: K, K + N or K + D
+        # the tangent without its border: K or K + N
         inner = tangent.K if isinstance(tangent, BorderedTangent) else tangent
         self.skewed = isinstance(inner, SkewedTangent)
         with self.stopwatch:
-            self._border = self._correction = self._correction_solver = None
-            # a border adds to the count of negative pivots of its K, which must be known first
-            needs_inertia = needs_inertia or inner is not tangent
-            is_factored = isinstance(inner, CorrectedTangent) and self._factor_sparse_part(
-                inner, needs_inertia=needs_inertia
-            )
-            if not is_factored:
-                self._factor_symmetric(symmetric_part(inner))
+            self._border = None
+            self._factor_symmetric(symmetric_part(inner))
             if isinstance(inner, SkewedTangent):
                 self._factor_sum(inner)
         self.count += 1
@@ -183,81 +139,11 @@ class Factorisation:
 
     def _factor_symmetric(self, K: PETSc.Mat) -> None:
         """Factor a sparse symmetric matrix, by CHOLMOD if possible, else by MUMPS."""
-        self.matrix, self.inertia_uncertainty, self.inertia_is_known = K, np.inf, True
+        self.matrix = K
         if self._rhs is None:
             self._rhs, self._solution = K.createVecs()
         if not (self._tries_cholmod and self._factor_by_cholmod(K)):
             self._factor_by_mumps(K)
-
-    @property
-    def correction_is_small(self) -> bool:
-        """Whether D of the tangents so far was small compared with K."""
-        return self._products is not None and self._full_factorisations_left <= 1
-
-    def _factor_sparse_part(self, tangent: CorrectedTangent, *, needs_inertia: bool) -> bool:
-        """Factor the sparse part K of K + D, for solutions by iteration with D.
-
-        Parameters
-        ----------
-        needs_inertia
-            Whether the negative pivots of K + D are counted now.
-
-        Returns
-        -------
-        Whether these factors serve; False if D is not small compared with K, now or shortly before.
-        """
-        # after a failure the next matrices are factored with all entries
-        self._full_factorisations_left -= 1
-        if self._full_factorisations_left > 0:
-            return False
-        self._factor_symmetric(tangent.K)
-        # stored products are kept if D is a multiple of the earlier one
-        self._products = (self._products or ProductCache(tangent.D)).cache_for(tangent.D)
-        self._correction, self._corrected, self.inertia_is_known = tangent.D, tangent, False
-        # the count fails where D is not small
-        return not needs_inertia or self.count_corrected_inertia()
-
-    def count_corrected_inertia(self) -> bool:
-        """Count the negative pivots of K + D by the factors of K. Collective.
-
-        On the way from K to K + D the matrix becomes singular a few times, and each time one pivot
-        changes its sign (`krylov_correction`). How certain the count is, `inertia_uncertainty`
-        tells afterwards.
-
-        Returns
-        -------
-        Whether the factors of K serve; False if D is not small compared with K.
-        """
-        tangent, products = self._corrected, self._products
-        if not tangent or not products:  # an earlier count failed
-            return False
-        # K^-1 times random numbers, the same in each run
-        random = np.random.default_rng(self.comm.rank)
-        start_vector = self._solve_sparse(random.standard_normal(tangent.K.getLocalSize()[0]))
-        crossings = count_crossings(products.times, self._solve_sparse, start_vector, self.comm)
-        if crossings is None:
-            self._full_factorisations_left = FULL_FACTORISATIONS_AFTER_FAILURE
-            self._products = self._correction = None
-            return False
-        # the same count, with the uncertainty that a lagged part of D adds
-        crossings = crossings_with_lag(
-            tangent, crossings, self._solve_sparse, self._sparse_product, start_vector, self.comm
-        )
-        self.inertia_uncertainty, self.inertia_is_known = crossings.uncertainty, True
-        self.negative_pivots += crossings.added
-        return True
-
-    def missing_product(self, x: Vector) -> Vector:
-        """Return x times the difference of the present and the lagged part of the latest tangent.
-
-        The present part is extrapolated from earlier states. The product is zero if no part is
-        lagged. Collective.
-        """
-        # entries for the unknowns of a border stay zero
-        product, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
-        if self._correction and self._corrected:
-            product[:rows] = self._corrected.missing_product(x[:rows])
-        return product
 
     def _factor_by_cholmod(self, K: PETSc.Mat) -> bool:
         """Try to factor K by CHOLMOD.
@@ -344,7 +230,7 @@ class Factorisation:
         """Return the matrix last factored times x. Collective."""
         return self._border.times(x) if self._border else self._product(x)
 
-    def solve(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
+    def solve(self, rhs: Vector) -> Vector:
         """Return the solution of the matrix last factored for a right side. Collective.
 
         Parameters
@@ -352,14 +238,8 @@ class Factorisation:
         rhs
             This rank's part of the right side; for a bordered matrix with its unknowns on the last
             rank.
-        low_accuracy
-            Whether a relative residual of `LOOSE_TOLERANCE` is enough for a corrected matrix K + D.
         """
-        return (
-            self._border.solve(rhs)
-            if self._border
-            else self._solve_inner(rhs, low_accuracy=low_accuracy)
-        )
+        return self._border.solve(rhs) if self._border else self._solve_inner(rhs)
 
     def solve_transposed(self, rhs: Vector) -> Vector:
         """Return the solution of the transposed matrix for a right side. Collective."""
@@ -375,8 +255,6 @@ class Factorisation:
 
             return applied
 
-        if self._correction:
-            return self.solve(rhs)  # K + D is symmetric
         assert self._pc is not None
         solve, times = as_map(self._pc.applyTranspose), as_map(self.matrix.multTranspose)
         if self._bordered:  # only K changes by the transposition
@@ -384,62 +262,23 @@ class Factorisation:
         return solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
-        """Return the inner matrix, K, K + N or K + D, times x. Collective."""
-        return self._sparse_product(x) + (self._correction.times(x) if self._correction else 0.0)
-
-    def _sparse_product(self, x: Vector) -> Vector:
-        """Return the sparse matrix last factored times x. Collective."""
+        """Return the inner matrix, K or K + N, times x. Collective."""
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
         return np.array(y.array_r)
 
-    def _solve_inner(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
-        """Return the inverse of the inner matrix, K, K + N or K + D, times `rhs`. Collective.
+    def _solve_inner(self, rhs: Vector) -> Vector:
+        """Return the inverse of the inner matrix, K or K + N, times `rhs`. Collective.
 
-        With a dense correction D an iteration finds the solution, preconditioned by the factors of
-        K; with `low_accuracy` to a relative residual of `LOOSE_TOLERANCE`. The result is NaN if
-        K + D is so nearly singular that the factors of K do not serve.
+        Its time is counted.
         """
-        if self._correction is None:
-            return self._solve_sparse(rhs)
-        assert self._products
-        self._correction_solver = self._correction_solver or CorrectionSolver(
-            self._solve_sparse, self._solve_columns, self._products, self.comm, len(rhs)
-        )
-        tolerance = LOOSE_TOLERANCE if low_accuracy else TOLERANCE
-        return self._correction_solver.solve(self._solve_sparse(rhs), tolerance)
-
-    def _solve_sparse(self, rhs: Vector) -> Vector:
-        """Return K^-1 rhs with the sparse factors alone; its time is counted. Collective."""
         assert self._pc is not None
         assert self._rhs is not None
         with self.solving:
             self._rhs.setArray(rhs)
             self._pc.apply(self._rhs, self._solution)
             return np.array(self._solution.array_r)
-
-    def _solve_columns(self, columns: Array) -> Array:
-        """Return K^-1 times columns, all in one solve. Collective.
-
-        Parameters
-        ----------
-        columns
-            (rows of this rank, count).
-        """
-        assert self._pc is not None
-        # dense matrices of PETSc, which stores them by columns
-        rows = (len(columns), PETSc.DETERMINE)
-        B = PETSc.Mat().createDense(
-            (rows, columns.shape[1]), array=np.array(columns, order="F"), comm=self.comm
-        )
-        X = B.duplicate()
-        with self.solving:
-            self._pc.matApply(B, X)
-        solutions = np.array(X.getDenseArray())
-        B.destroy()
-        X.destroy()
-        return solutions
 
 
 @cache

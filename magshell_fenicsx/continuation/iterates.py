@@ -29,27 +29,6 @@ ROUNDING_FACTOR = 10.0  # steps up to this many times the rounding error count a
 Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
-def extrapolated_error(sizes: Sequence[float], ratios: int) -> float:
-    """Return the error after the last step, if all further steps shrink like the last ones.
-
-    Parameters
-    ----------
-    sizes
-        Sizes of the steps so far.
-    ratios
-        Number of the last ratios of successive steps of which the largest counts.
-
-    Returns
-    -------
-    The error; infinite if there are too few steps or one of the ratios is too large.
-    """
-    if len(sizes) <= ratios:
-        return np.inf
-    ratio = max(b / a for a, b in pairwise(sizes[-1 - ratios :]))
-    # the sum of a geometric series
-    return sizes[-1] * ratio / (1 - ratio) if ratio <= EXTRAPOLATION_RATIO else np.inf
-
-
 @dataclass(frozen=True)
 class NewtonStep:
     """The next step at an iterate of Newton's method, by its size.
@@ -110,9 +89,11 @@ class Iterates:
         One small ratio is not enough: bending may converge at once and hide that stretching
         converges slowly.
         """
-        if self.kinks or self.searched:
+        if self.kinks or self.searched or len(self.steps) < 3:
             return np.inf
-        return extrapolated_error([step.size for step in self.steps], ratios=2)
+        ratio = max(b.size / a.size for a, b in pairwise(self.steps[-3:]))
+        # the sum of a geometric series, where all further steps shrink like these
+        return self.steps[-1].size * ratio / (1 - ratio) if ratio <= EXTRAPOLATION_RATIO else np.inf
 
     @property
     def error(self) -> float:

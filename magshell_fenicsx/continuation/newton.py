@@ -11,9 +11,7 @@ equation g = 0: a prescribed load, conjugate displacement (on which mu does work
 The argument `stress` is a list of displacements with weights: K takes the weighted sum of their
 stresses in place of the stress of u, since small errors of a guess u change its own stress much.
 Lengths are displacements in units of the system's length. Negative pivots of K count unstable
-directions. Forces of terms that couple all unknowns are extrapolated from earlier states where they
-are small; `_tangent.lagged` tells whether the part of K that belongs to them is of an earlier
-state.
+directions.
 """
 
 from collections.abc import Sequence
@@ -31,8 +29,6 @@ from magshell_fenicsx.continuation.control import (
 )
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.snes import (
-    DIVERGED,
-    GUESS_TOO_FAR,
     HIDDEN_BY_ROUNDING,
     REASON_MESSAGES,
     LatestTangent,
@@ -164,8 +160,7 @@ class BorderedNewton:
     ) -> NewtonResult:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
-        If full steps with extrapolated forces fail, they are repeated with computed forces; then
-        softer faces and a line search are tried. Collective.
+        If full steps fail, softer faces and a line search are tried. Collective.
 
         Parameters
         ----------
@@ -182,14 +177,7 @@ class BorderedNewton:
             end the solve early too: a shorter step of the path then costs less.
         """
         options = SolveOptions(stress, reuse_distance, max_step)
-        extrapolating = replace(options, extrapolating=self._tangent.may_extrapolate)
-        # full steps, with extrapolated forces where these are allowed
-        result = self._run_snes(self._full_steps, guess, name, row, extrapolating)
-        # again with computed forces, unless these would lead away as well
-        if not result.converged and self._callbacks.extrapolating:
-            leads_away = result.reason in (DIVERGED, GUESS_TOO_FAR)
-            if not leads_away or self._callbacks.is_misled_by_extrapolation():
-                result = self._run_snes(self._full_steps, guess, name, row, options)
+        result = self._run_snes(self._full_steps, guess, name, row, options)
         # rounding hides the solution whatever the steps
         if result.converged or result.reason == HIDDEN_BY_ROUNDING:
             return result
@@ -276,7 +264,7 @@ class BorderedNewton:
     def ensure_factors_near(self, state: State, distance: float = np.inf) -> None:
         """Factor the tangent at a state unless factors of a near state are known. Collective.
 
-        A resumed run may have none. The inertia of the factors is not counted.
+        A resumed run may have none.
 
         Parameters
         ----------
@@ -284,7 +272,7 @@ class BorderedNewton:
             Largest difference of an entry of u, in lengths of the system.
         """
         if not self._tangent.is_near(state, distance):
-            self._tangent.factor_at(state, needs_inertia=False)
+            self._tangent.factor_at(state)
 
     def correct_once(
         self, guess: State, name: str, row: ConstraintRow, max_step: float
@@ -302,9 +290,7 @@ class BorderedNewton:
         """
         system = self.system
         matrix = BorderedMatrix(system, self.factorisation, guess, name, row)
-        step = matrix.solve(
-            system.residual(guess.u, guess.mu), row.residual(guess), low_accuracy=True
-        )
+        step = matrix.solve(system.residual(guess.u, guess.mu), row.residual(guess))
         if not matrix.size(step) <= max_step:
             return None
         u, mu = add_scaled((guess.u, guess.mu[name]), -1.0, step)
@@ -327,8 +313,6 @@ class BorderedNewton:
         row: ConstraintRow,
         *,
         exact: bool = False,
-        may_lag: bool = True,
-        needs_inertia: bool = True,
     ) -> Response:
         """Return the path's tangent at a solution: K du + R_mu dmu = 0, c . du + d dmu = 1.
 
@@ -345,32 +329,18 @@ class BorderedNewton:
             The last row, whose gradient is (c, d).
         exact
             Whether K is factored at the solution itself, not at a nearby state.
-        may_lag
-            Whether a small part of K may belong to an earlier state. If not, K is factored at the
-            solution.
-        needs_inertia
-            If not, the number of negative pivots is meaningless.
         """
         factored = self._tangent.state  # None if no factors are known
         distance = self._distance(state, factored)
-        may_reuse_factors = may_lag and not exact
-        reuses_factors = distance <= self.options.reuse_distance and may_reuse_factors
-        if reuses_factors and needs_inertia:
-            reuses_factors = self._tangent.inertia_is_certain
+        reuses_factors = distance <= self.options.reuse_distance and not exact
         matrix_state = factored if reuses_factors and factored else state
-        matrix = self._bordered_matrix(
-            matrix_state, name, row, may_lag=may_lag, needs_inertia=needs_inertia
-        )
+        matrix = self._bordered_matrix(matrix_state, name, row)
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         # the matrix is not quite that of the solution: its tangent is refined by differences
-        is_of_nearby_state = distance != 0 and reuses_factors
-        if is_of_nearby_state or self._tangent.lagged:
-            extrapolating = self._tangent.may_extrapolate
-            refined = refined_tangent(
-                self.system, matrix, tangent, state, load, row, extrapolating=extrapolating
-            )
+        if distance != 0 and reuses_factors:
+            refined = refined_tangent(self.system, matrix, tangent, state, load, row)
             if refined is None:  # too far: with a matrix of the solution itself
-                return self.response(state, name, row, may_lag=False)
+                return self.response(state, name, row, exact=True)
             tangent = refined
         du, dmu = tangent
         # q = -dPi/dmu: dq = -R_mu . du - Pi_mumu dmu
@@ -388,28 +358,19 @@ class BorderedNewton:
             return np.inf
         return max_abs(self.system.comm, state.u - factored.u) / self.system.length
 
-    def _bordered_matrix(
-        self, state: State, name: str, row: ConstraintRow, *, may_lag: bool, needs_inertia: bool
-    ) -> BorderedMatrix:
+    def _bordered_matrix(self, state: State, name: str, row: ConstraintRow) -> BorderedMatrix:
         """Return the bordered matrix at a state.
 
         It is that of the last solve, if this had the same state and row.
-
-        Parameters
-        ----------
-        may_lag
-            Whether a small part of K may belong to an earlier state.
-        needs_inertia
-            Whether the number of negative pivots must be valid.
         """
         last_matrix, count = self._callbacks.matrix, self.factorisation.count
-        factors = self._tangent.factor_at(state, may_lag=may_lag, needs_inertia=needs_inertia)
+        factors = self._tangent.factor_at(state)
         if last_matrix and count == factors.count:
             # the same objects, not equal ones
             has_same_border = last_matrix.row is row and last_matrix.state is state
             if has_same_border:
                 return last_matrix
-        return BorderedMatrix(self.system, factors, state, name, row, lagged=self._tangent.lagged)
+        return BorderedMatrix(self.system, factors, state, name, row)
 
 
 @dataclass

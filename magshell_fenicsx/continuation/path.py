@@ -368,7 +368,6 @@ class Path:
             self.name,
             row,
             exact=self._has_many_hard_solves,
-            needs_inertia=needs_inertia,
         )
         return replace(
             self._point(result.state, s, response),

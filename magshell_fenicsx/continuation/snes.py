@@ -9,19 +9,16 @@ errors of its soft part.
 R = dPi/du is the residual of equilibrium, K its derivative by u, g the residual of the row: the
 scalar equation that is solved together with equilibrium for u and the amplitude (load parameter)
 mu. A direction is a pair (du, dmu). A kept matrix gets Broyden's updates (`Chord`), and is an
-iterate's own if it was computed there. Dense terms couple all unknowns: their part of K may lag,
-that is belong to an earlier state, and their forces may be extrapolated from earlier states while
-steps are long. The argument `stress` is a list of displacements with weights: the weighted sum of
-their stresses replaces the stress of u in K, since small errors of a guess u change its own stress
-much. Lengths are displacements in units of the system's length.
+iterate's own if it was computed there. The argument `stress` is a list of displacements with
+weights: the weighted sum of their stresses replaces the stress of u in K, since small errors of a
+guess u change its own stress much. Lengths are displacements in units of the system's length.
 
 `Iterates` has the steps of a solve with their sizes and judges by these whether it has converged. A
-step is `is_own` if the matrix of that iterate made it. A system is an `InexactSystem` if its dense
-terms may lag or be extrapolated.
+step is `is_own` if the matrix of that iterate made it.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -30,16 +27,9 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import BorderedMatrix, Chord, ConstraintRow, add_scaled
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.iterates import (
-    QUADRATIC_RATIO,
-    Iterates,
-    NewtonStep,
-    Verdict,
-    extrapolated_error,
-)
+from magshell_fenicsx.continuation.iterates import Iterates, NewtonStep, Verdict
 from magshell_fenicsx.continuation.system import (
     Direction,
-    InexactSystem,
     State,
     System,
     WeightedDisplacement,
@@ -50,16 +40,6 @@ from magshell_fenicsx.platform import compat
 
 # this fraction of the largest displacement counts as the length where it exceeds the system's
 LENGTH_PER_DISPLACEMENT = 0.1
-# of `Factorisation.inertia_uncertainty`, up to which D may be that of an earlier state
-MAX_INERTIA_UNCERTAINTY = 1.0
-MATRICES_WITH_LAG = 3  # matrices of a solve after which their lagged part is renewed, once
-# in lengths: after a longer step a renewed part would soon be too old again
-MAX_STEP_WITH_RENEWAL = 1.0
-# size of a step with extrapolated forces over the largest one since forces were computed: below
-# this ratio they are computed again
-EXTRAPOLATED_STEP_RATIO = 0.01
-# fraction of the tolerance: a smaller error after computed forces is not verified again
-CERTAIN_ERROR = 0.1
 LINE_SEARCH_PATIENCE = 12  # matrices after which the steps of a line search must have shrunk
 PREFIX = "magshell_"  # options with this prefix belong to this solver alone
 DIVERGED, GUESS_TOO_FAR = "the iteration diverged", "the first guess is too far away"
@@ -140,11 +120,6 @@ class NewtonOptions:
 class LatestTangent:
     """The factors of the latest tangent of a system, and the state to which they belong.
 
-    Attributes
-    ----------
-    lagged
-        Whether a small part of the tangent, of dense terms, belongs to an earlier state.
-
     Private fields: `_factored` has the state that was factored last and the number of its
     factorisation; `_has_other_stress` tells whether the stress was not that of the state.
     """
@@ -153,7 +128,6 @@ class LatestTangent:
         self.system, self._factorisation = system, factorisation
         self._factored: tuple[State | None, int] = None, 0
         self._has_other_stress = False
-        self.lagged = False
 
     @property
     def state(self) -> State | None:
@@ -179,41 +153,21 @@ class LatestTangent:
             return False
         return max_abs(system.comm, state.u - factored.u) < distance * system.length
 
-    def factor_at(
-        self,
-        state: State,
-        stress: Sequence[WeightedDisplacement] = (),
-        *,
-        may_lag: bool = False,
-        needs_inertia: bool = True,
-    ) -> Factorisation:
+    def factor_at(self, state: State, stress: Sequence[WeightedDisplacement] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are known. Collective.
 
         Parameters
         ----------
         stress
             Weighted displacements whose stress replaces that of the state; empty: its own.
-        may_lag
-            Whether a small part of the tangent may belong to an earlier state.
-        needs_inertia
-            Whether the number of unstable directions must be right in spite of such a part.
 
         Returns
         -------
         The factors, which the next call overwrites.
         """
-        factors, is_of_other_state = self._factorisation, self._is_of_other_state(state)
-        # with an exact tangent required, a lagged one does not serve, even of the same state
-        is_too_old = self.lagged and not may_lag
-        must_factor = is_of_other_state or is_too_old
-        if needs_inertia and not must_factor:
-            must_factor = not self.inertia_is_certain
-        if must_factor:
-            self.lagged = may_lag and factor_with_lag(
-                self.system, factors, state, stress, needs_inertia=needs_inertia
-            )
-            if not self.lagged:
-                factors.factor(self.system.tangent(state.u, state.mu, stress))
+        factors = self._factorisation
+        if self._is_of_other_state(state):
+            factors.factor(self.system.tangent(state.u, state.mu, stress))
             self._factored, self._has_other_stress = (state, factors.count), bool(stress)
         return factors
 
@@ -225,62 +179,6 @@ class LatestTangent:
         if factored is None or self._has_other_stress:
             return True
         return not factored.equals(state, self.system.comm)
-
-    @property
-    def may_extrapolate(self) -> bool:
-        """Whether forces of dense terms may be extrapolated from earlier states.
-
-        There must be such terms, and their part of the tangent must have been small so far.
-        """
-        if not isinstance(self.system, InexactSystem):
-            return False
-        return self.system.has_dense_terms and self._factorisation.correction_is_small
-
-    @property
-    def inertia_is_certain(self) -> bool:
-        """Whether the number of unstable directions is right in spite of a lagged part. Collective.
-
-        The negative pivots are counted, if they were not yet.
-        """
-        factors = self._factorisation
-        is_known = factors.inertia_is_known or factors.count_corrected_inertia()
-        if not is_known:
-            return False
-        return not self.lagged or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
-
-
-def factor_with_lag(
-    system: System,
-    factors: Factorisation,
-    state: State,
-    stress: Sequence[WeightedDisplacement] = (),
-    *,
-    needs_inertia: bool = True,
-) -> bool:
-    """Factor a tangent whose dense terms belong to an earlier state. Collective.
-
-    Parameters
-    ----------
-    factors
-        Gets the factors.
-    stress
-        Weighted displacements whose stress replaces that of the state; empty: its own.
-    needs_inertia
-        Whether the number of unstable directions must be right in spite of the lag.
-
-    Returns
-    -------
-    Whether the factors serve; False if the system has no dense terms, or these are not small, now
-    or before.
-    """
-    if not (isinstance(system, InexactSystem) and system.has_dense_terms):
-        return False
-    # without a count of the inertia nothing shows whether the factors serve
-    if not (factors.correction_is_small or needs_inertia):
-        return False
-    tangent = system.tangent(state.u, state.mu, stress, inexact=True)
-    factors.factor(tangent, needs_inertia=needs_inertia)
-    return not needs_inertia or factors.inertia_uncertainty <= MAX_INERTIA_UNCERTAINTY
 
 
 @dataclass(frozen=True)
@@ -298,8 +196,6 @@ class SolveOptions:
         A longer step, in lengths, ends the solve early.
     searched
         Whether a line search shortens the steps.
-    extrapolating
-        Whether forces of dense terms may be extrapolated.
     relative_tolerance
         An error of this fraction of the first step is accepted.
     """
@@ -308,7 +204,6 @@ class SolveOptions:
     reuse_distance: float = 0.0
     max_step: float = np.inf
     searched: bool = False
-    extrapolating: bool = False
     relative_tolerance: float = 0.0
 
 
@@ -327,17 +222,13 @@ class SnesCallbacks:
     ----------
     matrix
         The bordered matrix of the present solve, or of the last one; None before the first.
-    extrapolating
-        Whether the solve may extrapolate forces of dense terms.
 
     Private fields: `_state` is the present iterate and `_next` the next step there, to be
     subtracted. `_x_counter`, `_f_counter` and `_f_handle` identify PETSc's vectors x and f to which
     that step belongs. `_chord` applies the matrix with Broyden's updates: its `step` is the next
     step for a residual. `_iterates` has the steps of the solve so far. `_stress` are the weighted
     displacements for the next matrix, and `_has_stress` tells whether the guess came with some.
-    `_is_extrapolated` tells whether the present residual has extrapolated forces, `_largest_step`
-    is the size of the largest step since forces were computed, and `_computed_steps` are sizes of
-    steps with computed forces. The other ones are the arguments of `begin`.
+    The other ones are the arguments of `begin`.
     """
 
     def __init__(self, tangent: LatestTangent, options: NewtonOptions) -> None:
@@ -366,19 +257,16 @@ class SnesCallbacks:
         options
             The way this one solve runs.
         """
-        self.extrapolating, self._is_extrapolated = options.extrapolating, False
-        self._largest_step, self._computed_steps = 0.0, list[float]()
         self._tolerance, self._reuse_distance = tolerance, options.reuse_distance
         self._guess, self._name, self._row = guess, name, row
         self._stress, self._has_stress = options.stress, bool(options.stress)
         newton, has_coordinates = self._options, bool(self._system.coordinates)
-        has_kinks = newton.has_onsets or options.extrapolating
         self._iterates = Iterates(
             largest=min(newton.largest_step, options.max_step),
             patience=LINE_SEARCH_PATIENCE if options.searched else newton.patience,
             searched=options.searched,
             # the force of a body is stiff
-            kinks=has_kinks or has_coordinates,
+            kinks=newton.has_onsets or has_coordinates,
             stops_early=options.max_step < np.inf,
             relative_tolerance=options.relative_tolerance,
         )
@@ -399,16 +287,8 @@ class SnesCallbacks:
 
         `snes` is not used here: PETSc passes it to every callback.
         """
-        self._is_extrapolated = self.extrapolating
-        self._compute(self._state_of(x), f)
-
-    def _compute(self, state: State, f: PETSc.Vec) -> None:
-        """Write R, extrapolated where the present iterate may be, and g at a state into f."""
-        if self._is_extrapolated:
-            assert isinstance(self._system, InexactSystem)
-            R = self._system.residual(state.u, state.mu, inexact=True)
-        else:
-            R = self._system.residual(state.u, state.mu)
+        state = self._state_of(x)
+        R = self._system.residual(state.u, state.mu)
         self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
@@ -460,9 +340,6 @@ class SnesCallbacks:
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
         """Choose the matrix for an iterate, and compute its next step; once for each iterate.
 
-        If the step is too small for extrapolated forces, the forces are computed and f is
-        overwritten.
-
         Parameters
         ----------
         x, f
@@ -479,62 +356,8 @@ class SnesCallbacks:
             self._go_on(previous, state)
         self._x_counter, self._state = x.stateGet(), state
         self._next = self._next_step(state, self.split(f))
-        size = self._iterates.steps[-1].size
-        # too small for extrapolated forces: the same step again with computed ones
-        if self._is_extrapolated and not size > self._extrapolated_size(state):
-            self._is_extrapolated = False
-            self._compute(state, f)
-            self._next = self._repeated_step(self.split(f))
-            size = self._iterates.steps[-1].size
-            self._computed_steps.append(size)
-            self._largest_step = size  # extrapolation begins anew
-        self._largest_step = max(self._largest_step, size)
-        # f as it is now is the residual whose step is known
         self._f_handle, self._f_counter = f.handle, f.stateGet()
         return state
-
-    def _extrapolated_size(self, state: State) -> float:
-        """Return the size down to which a step may use extrapolated forces, in lengths.
-
-        For a smaller step the forces are computed. The result is negative, so that they never are
-        again, once computed forces have shown an error far below the tolerance.
-        """
-        converged = self._converged_size(state)
-        # the error after the last step with computed forces, from the ratio of only two steps: each
-        # computation of these forces costs much
-        if extrapolated_error(self._computed_steps, ratios=1) <= CERTAIN_ERROR * converged:
-            return -1.0
-        # the limit falls with every computation
-        ratio = float(EXTRAPOLATED_STEP_RATIO ** (1 + len(self._computed_steps) / 2))
-        return max(converged, ratio * self._largest_step)
-
-    def is_misled_by_extrapolation(self) -> bool:
-        """Return whether extrapolated forces have misled the last step. Collective.
-
-        This is so if computed forces make the step much shorter; True too if no such comparison is
-        possible.
-        """
-        if not (self._is_extrapolated and self._state):
-            return True
-        if not (self._chord and self.matrix):
-            return True
-        state, size = self._state, self._iterates.steps[-1].size
-        # (R, g) with computed forces, and the step that they make
-        computed_residual = self._system.residual(state.u, state.mu), self._row.residual(state)
-        computed_size = self.matrix.size(self._chord.step(computed_residual))
-        # misled: with computed forces the step is at most half as long
-        return not computed_size > QUADRATIC_RATIO * size
-
-    def _repeated_step(self, f: Direction) -> Direction:
-        """Replace the last step, which had extrapolated forces, by that for a residual `f`.
-
-        The matrix stays the same. Return the new step.
-        """
-        assert self.matrix
-        assert self._chord
-        step = self._chord.step(f)
-        self._iterates.steps[-1] = replace(self._iterates.steps[-1], size=self.matrix.size(step))
-        return step
 
     def _go_on(self, previous: State, state: State) -> None:
         """Go on from the previous iterate to a new one.
@@ -574,58 +397,13 @@ class SnesCallbacks:
                 return step
         # a new matrix of this iterate; at the first one factors of a near state may serve
         is_own = bool(steps) or not self._tangent.is_near(state, self._reuse_distance)
-        # after some matrices with a lagged part one without, since the lag may slow the solve
-        own_count = sum(step.is_own for step in steps)
-        renews = own_count == MATRICES_WITH_LAG and not self.extrapolating
-        factors = self._tangent.latest
-        if is_own:
-            factors = self._tangent.factor_at(
-                state, self._stress, may_lag=not renews, needs_inertia=False
-            )
-        matrix, step = self._matrix_and_step(factors, state, f)
-        # once more without a lagged part, if that is the reason why steps do not shrink
-        if is_own and self._lag_slows(matrix, step):
-            factors = self._tangent.factor_at(state, self._stress, needs_inertia=False)
-            matrix, step = self._matrix_and_step(factors, state, f)
+        factors = self._tangent.factor_at(state, self._stress) if is_own else self._tangent.latest
+        matrix = BorderedMatrix(self._system, factors, state, self._name, self._row)
+        step = matrix.solve(*f)
         self.matrix = matrix
-        self._chord = Chord(lambda f: matrix.solve(*f, low_accuracy=True), matrix.inner, add_scaled)
+        self._chord = Chord(lambda f: matrix.solve(*f), matrix.inner, add_scaled)
         steps.append(NewtonStep(matrix.size(step), is_own=is_own, pivots=factors.negative_pivots))
         return step
-
-    def _matrix_and_step(
-        self, factors: Factorisation, state: State, f: Direction
-    ) -> tuple[BorderedMatrix, Direction]:
-        """Return the bordered matrix with given factors, and its step for the residual f."""
-        matrix = BorderedMatrix(
-            self._system, factors, state, self._name, self._row, lagged=self._tangent.lagged
-        )
-        return matrix, matrix.solve(*f, low_accuracy=True)
-
-    def _lag_slows(self, matrix: BorderedMatrix, step: Direction) -> bool:
-        """Return whether the lagged part of the matrix is the reason why steps do not shrink.
-
-        The part was small at its own state, but need not be so now. After the step a residual is
-        left: the part of the tangent that the matrix lacks, times the step. The extrapolated forces
-        give this product. If it causes a long next step, the lag is the reason.
-
-        Parameters
-        ----------
-        step
-            The step by the matrix.
-        """
-        # sizes of earlier steps by matrices of their own iterates
-        own_sizes = [s.size for s in self._iterates.steps if s.is_own]
-        size, contraction = matrix.size(step), self._options.late_contraction
-        if not (self._tangent.lagged and own_sizes):
-            return False
-        # the step shrinks enough, or is so long that a renewed part would soon be too old
-        if not contraction * own_sizes[-1] < size < MAX_STEP_WITH_RENEWAL:
-            return False
-        du, _ = step
-        # the residual that is left after the step, and the size of the next step that it causes
-        missing = self._tangent.latest.missing_product(du)
-        next_size = matrix.size(matrix.solve(missing, 0.0, low_accuracy=True))
-        return not next_size <= contraction * size
 
     def _matrix_serves(self, size: float) -> bool:
         """Return whether to keep the matrix, whose next step has this size in lengths.

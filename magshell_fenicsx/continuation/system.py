@@ -5,13 +5,12 @@ mu (load parameters and prescribed positions), and the residual and tangent of a
 Pi(u; mu). This module defines that interface and the forms that a tangent may have.
 
 An amplitude's conjugate -dPi/dmu is the displacement on which it does work, or the force if the
-amplitude is a position. A lagged part of a tangent, from terms that couple all unknowns, belongs to
-an earlier state.
+amplitude is a position.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from mpi4py import MPI
@@ -22,55 +21,6 @@ Vector = NDArray[np.float64]  # the part of a distributed vector that this rank 
 Amplitudes = Mapping[str, float]
 WeightedDisplacement = tuple[float, Vector]
 Direction = tuple[Vector, float]  # (du, dmu)
-
-
-class DenseCorrection(Protocol):
-    """A constant symmetric matrix D with all entries, which is added to a sparse matrix."""
-
-    def times(self, v: Vector) -> Vector:
-        """Return D v. Collective."""
-
-    def scaled(self, factor: float) -> "DenseCorrection":
-        """Return the matrix `factor` D."""
-
-    def multiple_of(self, other: "DenseCorrection") -> float:
-        """Return c if D is c times another matrix; 0 if it is no multiple, or this is unknown."""
-
-    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
-        """Return K + D with all entries; the next call overwrites the result. Collective."""
-
-
-@dataclass(frozen=True)
-class CorrectedTangent:
-    """The symmetric matrix K + D, with all entries: K sparse, D mostly small compared with K.
-
-    Attributes
-    ----------
-    lagged
-        The part of K + D that may belong to an earlier state: D and its share of K. None stands
-        for D alone.
-    present_product
-        Product of a vector with the same part at the present state: expensive. None if no part is
-        lagged. Collective.
-    extrapolated_product
-        The same product, extrapolated from states at which forces were computed: cheap. None if no
-        part is lagged. Collective.
-    """
-
-    K: PETSc.Mat
-    D: DenseCorrection
-    lagged: DenseCorrection | None = None
-    present_product: Callable[[Vector], Vector] | None = None
-    extrapolated_product: Callable[[Vector], Vector] | None = None
-
-    def missing_product(self, v: Vector) -> Vector:
-        """Return a vector times the difference of the present and the lagged part, as extrapolated.
-
-        It is zero if no part is lagged. Collective.
-        """
-        if self.extrapolated_product is None or self.lagged is None:
-            return np.zeros_like(v)
-        return np.asarray(self.extrapolated_product(v) - self.lagged.times(v))
 
 
 @dataclass(frozen=True)
@@ -96,24 +46,23 @@ class BorderedTangent:
         pivot that is no unstable direction.
     """
 
-    K: "PETSc.Mat | CorrectedTangent | SkewedTangent"
+    K: PETSc.Mat | SkewedTangent
     C: Sequence[Vector]
     D: NDArray[np.float64]
     multipliers: int
 
 
-Tangent: TypeAlias = PETSc.Mat | CorrectedTangent | SkewedTangent | BorderedTangent
+Tangent: TypeAlias = PETSc.Mat | SkewedTangent | BorderedTangent
 
 
 def symmetric_part(tangent: Tangent) -> PETSc.Mat:
-    """Return the symmetric matrix of PETSc in a tangent: K or, for a corrected one, K + D.
+    """Return the symmetric matrix K of a tangent, itself and not a copy.
 
-    A border and a skew part are left out. K is the matrix itself, not a copy; K + D has all entries
-    and is overwritten by the next call.
+    A border and a skew part are left out.
     """
     while isinstance(tangent, SkewedTangent | BorderedTangent):
         tangent = tangent.K
-    return tangent.D.added_to(tangent.K) if isinstance(tangent, CorrectedTangent) else tangent
+    return tangent
 
 
 class System(Protocol):
@@ -164,52 +113,6 @@ class System(Protocol):
             Displacements with weights. A system may use the weighted sum of their stresses in place
             of the stress of u. That sum is linear along the path, while small errors of a guess u
             change its own stress much.
-        """
-
-
-@runtime_checkable
-class InexactSystem(Protocol):
-    """A system whose dense terms may be lagged or extrapolated from earlier states.
-
-    Dense terms couple all unknowns. They are expensive, and mostly small compared with the others.
-
-    Attributes
-    ----------
-    has_dense_terms
-        Whether the system has such terms.
-    """
-
-    @property
-    def has_dense_terms(self) -> bool: ...
-
-    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        """Return R = dPi/du. Collective.
-
-        Parameters
-        ----------
-        inexact
-            Whether forces of the dense terms may be extrapolated from earlier states.
-        """
-
-    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        """Return whether extrapolated forces near a state are accurate along the direction du."""
-
-    def tangent(
-        self,
-        u: Vector,
-        mu: Amplitudes,
-        stress: Sequence[WeightedDisplacement] = (),
-        *,
-        inexact: bool = False,
-    ) -> Tangent:
-        """Assemble K = d2Pi/du2, or dR/du where a load has no potential. Collective.
-
-        Parameters
-        ----------
-        stress
-            Displacements with weights, whose stress may replace that of u.
-        inexact
-            Whether its dense terms may be those of an earlier state.
         """
 
 

@@ -40,7 +40,6 @@ from magshell_fenicsx.continuation.snes import LENGTH_PER_DISPLACEMENT
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
     BorderedTangent,
-    CorrectedTangent,
     SkewedTangent,
     State,
     System,
@@ -48,6 +47,7 @@ from magshell_fenicsx.continuation.system import (
     Vector,
     dot,
     max_abs,
+    symmetric_part,
 )
 
 # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
@@ -610,8 +610,7 @@ class Integrator:
         viscous = self.viscous
         tangent = viscous.tangent(u, mu, dt, rate) if viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, BorderedTangent)
-        # beside the matrix K a tangent may have a skew part N, or a dense correction D
-        K = tangent.K if isinstance(tangent, SkewedTangent | CorrectedTangent) else tangent
+        K = symmetric_part(tangent)  # beside it a tangent may have a skew part N
         # the tangent is another object, for example after a change of contact: it may have another
         # pattern, so the matrix of the step is made anew
         is_other = self._tangent is None or self._tangent.handle != K.handle
@@ -625,8 +624,6 @@ class Integrator:
         matrix: Tangent = self._K
         if isinstance(tangent, SkewedTangent):
             matrix = SkewedTangent(self._K, fraction * tangent.N)
-        elif isinstance(tangent, CorrectedTangent):
-            matrix = CorrectedTangent(self._K, tangent.D.scaled(fraction))
         if self.device:
             C, D = self.device.border(u, mu)
             columns = [fraction * column for column in C]

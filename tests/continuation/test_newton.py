@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from continuation.toys import Stiffening, Toy, pitchfork
+from continuation.toys import Toy, pitchfork
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import PrescribedConjugate, PrescribedLoad
@@ -118,16 +118,3 @@ def test_the_linear_solver_serves_others(options: PETSc.Options) -> None:
     assert other.converged
     assert other.state.u == pytest.approx(plain.state.u, abs=1e-8)
     assert other.state.mu["load"] == pytest.approx(plain.state.mu["load"], abs=1e-8)
-
-
-def test_an_older_part_of_a_tangent_is_made_anew_where_steps_do_not_shrink() -> None:
-    """The dense term at u = 0.01 is 50 times too small at the root u = 1 of u + u^2 = 2: each step
-    would be doubled."""
-    system = Stiffening()
-    newton, start = BorderedNewton(system), np.full(system.size, 0.01)
-    newton.factor_at(State(start, {"load": 0.0}))
-    guess = State(np.where(np.arange(system.size) == 0, 1.01, 0.0), {"load": 2.0})
-    outcome = newton.solve(guess, "load", PrescribedLoad("load", 2.0))
-    assert outcome.converged, outcome.reason
-    assert outcome.state.u[0] == pytest.approx(1.0, abs=1e-9)
-    assert len(system.made) == 2, "it is has_dense_terms"

@@ -10,8 +10,6 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.system import (
     Amplitudes,
-    CorrectedTangent,
-    DenseCorrection,
     Vector,
     WeightedDisplacement,
 )
@@ -165,82 +163,3 @@ def matrix(entries: np.ndarray) -> PETSc.Mat:
     A.assemble()
     A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     return A
-
-
-@dataclass
-class Full:
-    """A `DenseCorrection` of one rank."""
-
-    D: Array
-
-    def times(self, v: Array) -> Array:
-        return self.D @ v
-
-    def scaled(self, factor: float) -> "Full":
-        return Full(factor * self.D)
-
-    def multiple_of(self, other: DenseCorrection) -> float:
-        return (
-            float(np.sum(self.D * other.D) / np.sum(other.D**2)) if isinstance(other, Full) else 0.0
-        )
-
-    def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
-        n = len(self.D)
-        return dense(self.D + K.getValues(range(n), range(n)))
-
-
-def dense(values: Array) -> PETSc.Mat:
-    """A symmetric matrix of PETSc with all entries."""
-    n = len(values)
-    K = PETSc.Mat().createAIJ([n, n], nnz=n, comm=MPI.COMM_SELF)
-    K.setValues(range(n), range(n), values)
-    K.assemble()
-    K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    return K
-
-
-class Stiffening:
-    """Springs k u + u^2, with a force on the first: the derivative 2 u of the latter is a dense
-    term of the tangent."""
-
-    comm = MPI.COMM_SELF
-    coordinates = frozenset[str]()
-    size, length, has_dense_terms = 20, 1.0, True
-
-    def __init__(self) -> None:
-        self.k = np.geomspace(1.0, 100.0, self.size)
-        self.made = list[Vector]()  # states at which the dense term was computed
-
-    def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        return np.asarray(self.k * u + u**2 + mu["load"] * self.load(u, mu, "load"))
-
-    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        return -np.eye(self.size)[0]
-
-    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        return -float(u[0])
-
-    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        return 0.0
-
-    def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        return True
-
-    def tangent(
-        self,
-        u: Vector,
-        mu: Amplitudes,
-        stress: Sequence[WeightedDisplacement] = (),
-        *,
-        inexact: bool = False,
-    ) -> CorrectedTangent:
-        if not (inexact and self.made):
-            self.made.append(np.array(u))
-        D, K = Full(np.diag(2 * self.made[-1])), dense(np.diag(self.k))
-        if not inexact:
-            return CorrectedTangent(K, D)
-
-        def present(v: Vector) -> Vector:
-            return np.asarray(2 * u * v)
-
-        return CorrectedTangent(K, D, D, present, present)

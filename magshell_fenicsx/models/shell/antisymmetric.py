@@ -19,7 +19,6 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.snes import factor_with_lag
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell import densities
@@ -102,12 +101,10 @@ class AntisymmetricModes:
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent of the antisymmetric modes at a symmetric state; collective.
 
-        The factorisation of the last state is kept. `factor_with_lag` tries a tangent whose dense
-        terms are those of an earlier state; else the present tangent is factored.
+        The factorisation of the last state is kept.
         """
         if self._factored is not state:
-            if not factor_with_lag(self.system, self._factorisation, state):
-                self._factorisation.factor(self.system.tangent(state.u, state.mu))
+            self._factorisation.factor(self.system.tangent(state.u, state.mu))
             self._factored = state
         return self._factorisation
 

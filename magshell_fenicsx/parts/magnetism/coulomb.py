@@ -6,10 +6,10 @@ pi mu_0),
     W = sum of q_i q_j/|x_i - x_j|, i in A, j in B,    x = r + zeta n,
 
 and that of a part in its own field half of this, with both in A: functions of the displacement by
-the places alone. Forces and stiffness are their derivatives, exact for the rule. Cells far from
-each other act by multipoles (`multipole_expansion`). All other pairs have a Gauss rule whose error
-is below `PRECISION` at their distance (`least_distance`), the same for both. Adjacent cells
-have the rules of `singular_pairs`, cells above each other those of `stacked_faces`.
+the places alone. Forces and stiffness are their derivatives, exact for the rule. Pairs of
+cells have a Gauss rule whose error is below `PRECISION` at their distance (`least_distance`), the
+same for both. Adjacent cells have the rules of `singular_pairs`, cells above each other those of
+`stacked_faces`.
 
 - A part is a set of connected cells; parts act on each other, or each also on itself.
 - Copies are the modelled cells and their images under mirrors and rotations, which make the whole
@@ -19,7 +19,6 @@ have the rules of `singular_pairs`, cells above each other those of `stacked_fac
   edges with one local number.
 - A rule is a quadrature rule on the reference triangle or edge, by its position in `DEGREES`. The
   charged points of a rule (`Points`) move with the nodes; their charges stay.
-- A multipole expansion stands for the charges of a box of cells at places far from it.
 - Own cells are those of this rank. Nodes are (copies * cells, k, 3), deformed and over R.
 """
 
@@ -38,7 +37,6 @@ from magshell_fenicsx.parts.magnetism.magnetised_cells import (
     MagnetisedShell,
     NodalDerivatives,
 )
-from magshell_fenicsx.parts.magnetism.multipole_expansion import MultipoleExpansion
 from magshell_fenicsx.parts.magnetism.pairs import (
     NO_IMAGES,
     Copies,
@@ -49,15 +47,10 @@ from magshell_fenicsx.parts.magnetism.pairs import (
 )
 from magshell_fenicsx.parts.magnetism.singular_pairs import CHARGE_TOLERANCE, SingularPairs
 from magshell_fenicsx.parts.magnetism.stacked_faces import StackedFaces
-from magshell_fenicsx.parts.magnetism.tree import Octree
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 DEGREES = (4, 5, 6, 8, 10, 14, 20, 30)  # of the rules on triangles
-MULTIPOLE_RULE = 2  # number of the rule of charges that act by multipoles
-RADIUS_RATIO = (
-    1.25  # the radius of a cell counts as a power of this times that of the undeformed cell
-)
 PRECISION = 1e-5  # relative, of a pair of cells at their distance
 DEGREE_OF_TOO_NEAR = (
     50  # degree of a rule for which cells are too wide: there is no number with that of 30
@@ -308,14 +301,8 @@ class InteractingCharges:
     _of_different_parts
         (copies * cells, copies * cells) whether two cells are in different parts.
     _acts_by_rule
-        Flags of the same shape: pairs that Gauss's rules or multipoles serve. A cell with itself
-        and adjacent cells are no such pairs.
-    _groups
-        (copies * cells,) group of each cell; cells of different groups act without multipoles.
-    _places, _radii
-        Middles and radii of the undeformed cells.
-    _boxes
-        The latest key of `boxes` with both results for it; None before the first.
+        Flags of the same shape: pairs that Gauss's rules serve. A cell with itself and adjacent
+        cells are no such pairs.
     _pairs
         The compiled sums over pairs.
     _singular_pairs, _stacked_faces
@@ -357,7 +344,7 @@ class InteractingCharges:
             if include_uncharged or charge > CHARGE_TOLERANCE * max(largest_charges)
         ]
         self._of_different_parts = np.asarray(parts[:, None] != parts)  # pairs of different parts
-        # pairs that a Gauss rule or multipoles may serve: not a cell with itself or an adjacent one
+        # pairs that a Gauss rule may serve: not a cell with itself or an adjacent one
         self._acts_by_rule = self._of_different_parts.astype(np.uint8)
         for cell, adjacent_cells in enumerate(singular_pairs.neighbours if singular_pairs else ()):
             self._acts_by_rule[cell] = 1
@@ -367,19 +354,12 @@ class InteractingCharges:
         # (copies * cells,) position of each cell in an order by the areas of parts
         order = _order_of_cells(shape, parts, len(copies.images))
         self._stacked_faces = StackedFaces(shape, faces.family, copies, parts, order, comm)
-        # only images along the axes map boxes of the octree to boxes; other copies are groups that
-        # act on each other without multipoles
-        along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
-        self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
-        self._places, self._radii = _balls(copies.nodes_of_all(shape.r0))
-        self._octree: Octree | None = None
-        self._boxes: tuple[Ints, MultipoleExpansion, NDArray[np.bool_]] | None = None
 
     def rules(self, nodes: Array, own_cells: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
         """Return the rule of each pair of cells, and which pairs have stacked faces.
 
         Both arrays are (own cells, copies * cells). A rule is a position in `DEGREES`, or -1 for a
-        pair that acts by multipoles, is adjacent, or does not act. Stacked faces are those of cells
+        pair that is adjacent, or does not act. Stacked faces are those of cells
         of two parts that lie above each other; `StackedFaces` integrates them, and their edges have
         the finest rule.
 
@@ -398,13 +378,12 @@ class InteractingCharges:
         least_distances = np.array([least_distance(degree) for degree in DEGREES])
         too_near = least_distance(DEGREE_OF_TOO_NEAR)
         own_rows = slice(own_cells.start, own_cells.stop)
-        _, is_too_near_for_multipoles = self.boxes(nodes, own_cells)
-        has_rule = self._acts_by_rule[own_rows] & is_too_near_for_multipoles
+        has_rule = self._acts_by_rule[own_rows]
         # of these, the pairs of different parts that lie above each other
         is_stacked = self._stacked_faces.find_stacked(
             nodes, own_cells, has_rule & self._of_different_parts[own_rows]
         )
-        has_rule &= ~is_stacked
+        has_rule = has_rule & ~is_stacked
         limits = PairLimits(
             h=self._h,
             space=MIN_DISTANCE,
@@ -418,32 +397,6 @@ class InteractingCharges:
             raise PartsTooNear
         rules[is_stacked] = len(DEGREES) - 1  # the finest, for their edges
         return rules, is_stacked
-
-    def boxes(self, nodes: Array, own_cells: range) -> tuple[MultipoleExpansion, NDArray[np.bool_]]:
-        """Return the multipole expansion, and flags of the pairs of cells too near for it.
-
-        The flags are (own cells, copies * cells). Cells are sorted into the boxes of an octree.
-        Both results depend on the present nodes alone, not on earlier ones. They are computed again
-        only if a cell has moved to another box or has grown.
-        """
-        acts_on_itself = self._singular_pairs is not None
-        self._octree = self._octree or Octree(
-            self._places, self._parts, self._groups, own_cells, acts_on_itself=acts_on_itself
-        )
-        places, radii = _balls(nodes)
-        # growth of each cell's radius, rounded to a power of `RADIUS_RATIO`
-        growth_steps = np.maximum(
-            0, np.ceil(np.log(radii / self._radii) / np.log(RADIUS_RATIO) - 0.5)
-        ).astype(np.int64)
-        # the boxes follow from this key: steps of each cell on a grid, and its growth
-        steps = self._octree.steps_moved(places)
-        key = np.column_stack([steps, growth_steps])
-        if self._boxes is None or not np.array_equal(key, self._boxes[0]):
-            radii_with_thickness = self._radii * RADIUS_RATIO ** key[:, 3] + self._h / 2
-            tree = self._octree.tree(key[:, :3], radii_with_thickness)
-            kinds = [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds]
-            self._boxes = key, MultipoleExpansion(tree, kinds, own_cells, self._pairs), tree.near
-        return self._boxes[1:]
 
     def evaluate(
         self, nodes: Array, own_cells: range, stiffness: Stiffness | None = None
@@ -470,11 +423,7 @@ class InteractingCharges:
             If two parts overlap, or are too near for the size of their cells.
         """
         (rules, is_stacked), gradient = self.rules(nodes, own_cells), np.zeros_like(nodes)
-        # pairs that act by multipoles; derivatives are collected at points
-        multipoles, _ = self.boxes(nodes, own_cells)
-        energy = multipoles.add(
-            multipoles.place_charges(nodes), with_second_derivatives=stiffness is not None
-        )
+        energy = 0.0
         first, second, rule_of_pair = _pairs_with_rules(rules, own_cells)
         # a pair of own cells stands in both orders, of which one is counted, wholly
         is_own_pair = (second >= own_cells.start) & (second < own_cells.stop)
@@ -492,7 +441,7 @@ class InteractingCharges:
                     nodes, charged_cells, count, left, right, gradient, stiffness
                 )
         # derivatives by points, which the sums have collected, are taken to the nodes
-        for number, kind in product({MULTIPOLE_RULE, *np.unique(rule_of_pair)}, self._kinds):
+        for number, kind in product(np.unique(rule_of_pair), self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         # adjacent cells, and faces above each other
         if self._singular_pairs:
@@ -538,18 +487,7 @@ class InteractingCharges:
         # complex nodes: imaginary parts of results are rates along v
         moved_nodes = nodes + COMPLEX_STEP * 1j * rates
         nodal_derivatives = self._shape.zero_derivatives(of_shape=of_shape)
-        # pairs that act by multipoles: for each kind derivatives by its charges, and with
-        # `of_shape` by their heights
-        multipoles, _ = self.boxes(nodes, own_cells)
-        cells_and_points = [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds]
-        by_far_charges = multipoles.charge_derivatives(
-            nodes, moved_nodes, cells_and_points, weights, heights=of_shape
-        )
-        for kind, (by_charges, *by_all_heights) in zip(self._kinds, by_far_charges, strict=True):
-            kind.add_derivatives(MULTIPOLE_RULE, by_charges, nodal_derivatives)
-            for by_heights in by_all_heights:
-                kind.add_height_derivatives(MULTIPOLE_RULE, by_heights, nodal_derivatives)
-        self._add_near_derivatives(
+        self._add_rule_derivatives(
             moved_nodes, own_cells, rules, is_stacked, weights, nodal_derivatives, of_shape=of_shape
         )
         # adjacent cells, and faces above each other
@@ -561,7 +499,7 @@ class InteractingCharges:
             )
         return nodal_derivatives
 
-    def _add_near_derivatives(
+    def _add_rule_derivatives(
         self,
         moved_nodes: Complex,
         own_cells: range,
@@ -680,9 +618,3 @@ def _areas(r0: Array) -> Array:
     return np.asarray(
         np.linalg.norm(np.cross(r0[:, 1] - r0[:, 0], r0[:, 2] - r0[:, 0]), axis=-1) / 2
     )
-
-
-def _balls(nodes: Array) -> tuple[Array, Array]:
-    """Return middles (cells, 3) and radii (cells,) of cells with nodes (cells, k, 3)."""
-    middle = nodes.mean(axis=1)
-    return middle, np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)

@@ -1,7 +1,7 @@
 """Magnetised parts of a shell in each other's field: the term of its energy.
 
-The energy couples all nodes, so the second derivative is dense: near blocks and multipoles
-(`multipole_expansion.InteractionHessian`). Theory: docs/theory.md, parts in each other's field.
+The energy couples all nodes, so the second derivative has all entries. Theory: docs/theory.md,
+parts that act on each other.
 
 - A part is a set of connected cells. Its remanence leaves charges on its faces and edges, and
   inside; the energy Pi is a sum over pairs of charges (`InteractingCharges`).
@@ -10,8 +10,7 @@ The energy couples all nodes, so the second derivative is dense: near blocks and
   images of the modelled cells, odd changes move them oppositely.
 - Own cells are those of this rank; the cells of all ranks are gathered (`GlobalCells`), and a
   "global" value is one for all nodes of the mesh, the same on every rank.
-- D is the second derivative of the energy. A block is its part (3, 3) for two nodes. An "inexact"
-  or extrapolated value is taken from earlier states.
+- D is the second derivative of the energy.
 - A state is one displacement u of all nodes.
 """
 
@@ -27,9 +26,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
 
-from magshell_fenicsx.assembly.dense_tangent import BlockProducts
 from magshell_fenicsx.assembly.global_mesh import (
     GlobalCells,
     component_numbers,
@@ -38,12 +35,9 @@ from magshell_fenicsx.assembly.global_mesh import (
 )
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
-from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation
 from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges, PartsTooNear
-from magshell_fenicsx.parts.magnetism.force_extrapolation import ForceExtrapolation
-from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
-from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, unit
-from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
+from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction, refuse_large
+from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
 from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
@@ -58,45 +52,10 @@ MAX_REMEMBERED_STATES = (
     3  # energies and forces: a point of a path is looked at again after its tangent
 )
 IMAGE_TOLERANCE = 1e-7  # between a node on a mirror plane and its image, over R
-MAX_UNKNOWNS = 9000  # a matrix of 650 MB where the sum is factored
 TOO_NEAR = (
     "magnetic.interaction: undeformed, two parts are nearer to each other than their thickness, "
     "or than a seventh of the size of their cells: move them apart, or take smaller cells"
 )
-
-
-def polar(F: Array) -> Array:
-    """Return the rotations (n, 3, 3) that are nearest to matrices F (n, 3, 3)."""
-    U, _, V = np.linalg.svd(F)
-    # a determinant of -1 is a reflection, where an iterate has turned a cell inside out
-    U[:, :, 2] *= np.linalg.det(U @ V)[:, None]
-    return np.asarray(U @ V)
-
-
-def _mark_blocks(
-    pattern: NDArray[np.bool_],
-    row_of: Ints,
-    column_of: Ints,
-    own_cells: range,
-    pairs: NDArray[np.bool_],
-) -> None:
-    """Set a pattern (rows, columns) to true for the nodes of pairs of cells.
-
-    Each own cell is also paired with itself.
-
-    Parameters
-    ----------
-    row_of, column_of
-        (cells, k) and (copies * cells, k) numbers of the nodes of cells as rows and as columns.
-    own_cells
-        Cells of this rank.
-    pairs
-        (own cells, copies * cells) whether two cells are a pair.
-    """
-    for cell, is_partner in zip(own_cells, pairs, strict=True):
-        partners = np.append(np.flatnonzero(is_partner), cell)
-        columns = np.unique(column_of[partners])
-        pattern[row_of[cell][:, None], columns] = True
 
 
 class InteractionTerm:
@@ -124,16 +83,13 @@ class InteractionTerm:
         The values by which the charges were made: placement, remanence and perhaps the thickness.
     _evaluations
         Nodes, energy and forces at the last states.
-    _latest_hessians
-        Nodes, both second derivatives there (by even and by odd changes) and u; None before the
-        first.
+    _latest_stiffness
+        Nodes, and the second derivatives there; None before the first.
     _even_term
         For a term from `antisymmetric`, the term that it was made from; else None.
     _charges, _singular_pairs, _copies, _corners, _part_of_cells
         Made at their first use: the charges, the pairs of adjacent cells, the modelled part with
         its images, and the corners and the part of each cell.
-    _extrapolation
-        Forces at earlier states, from which others are extrapolated.
 
     Raises
     ------
@@ -153,22 +109,10 @@ class InteractionTerm:
         self._comm: MPI.Comm = V.mesh.comm
         self._cells = GlobalCells.gather(V)
         self._even_term: InteractionTerm | None = None
-        unknowns = 3 * V.dofmap.index_map.size_global
-        if unknowns > MAX_UNKNOWNS:
-            raise CaseError(
-                f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on "
-                f"each other, at most {MAX_UNKNOWNS} are allowed: take a coarser mesh or a lower "
-                "mesh.degree"
-            )
+        refuse_large(3 * V.dofmap.index_map.size_global)
         self._inputs_of_charges: tuple[Array, ...] = ()
         self._evaluations = deque[tuple[Array, float, Array]](maxlen=MAX_REMEMBERED_STATES)
-        self._blocks, self._turning = BlockProducts(self._comm), BlockRotation(self._comm)
-        self._extrapolation = ForceExtrapolation(
-            self._blocks, self._rotations, is_single_rank=self._comm.size == 1
-        )
-        self._latest_hessians: (
-            tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None
-        ) = None
+        self._latest_stiffness: tuple[Array, Stiffness] | None = None
 
     @property
     def no_number(self) -> str:
@@ -228,74 +172,49 @@ class InteractionTerm:
         _, forces = self._evaluated()
         b += factor * forces
 
-    def add_extrapolated_residual(self, b: Array, factor: float) -> None:
-        """Add factor dPi/du to b, extrapolated from forces at earlier states; collective.
-
-        The forces are computed exactly if no earlier forces or second derivative are known. The
-        contract is that of `assembly.dense_tangent.DenseTerm`.
-        """
-        self._nodes()  # earlier results are forgotten here if shape or remanence changed
-        forces = None
-        if self._latest_hessians:
-            _, (even_hessian, _), u_of_hessians = self._latest_hessians
-            u = global_values(self._u).ravel()
-            forces = self._extrapolation.forces(u, even_hessian, u_of_hessians)
-        if forces is None:
-            _, forces = self._evaluated()
-        b += factor * forces
-
-    def extrapolation_holds_along(self, step: Array) -> bool:
-        """Return whether extrapolated forces are accurate along a step; collective.
-
-        They are accurate if forces are known at two states near the present one, and these states
-        differ along the step. `step` is a change of all local unknowns, with ghosts.
-        """
-        self._nodes()  # earlier results are forgotten here if shape or remanence changed
-        displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
-        step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
-        global_step = np.concatenate(self._comm.allgather(step_of_rank))
-        return self._extrapolation.extrapolation_holds_along(
-            displacement.ravel(), global_step.ravel()
-        )
-
     def compile_tangent(self) -> None:
         """Compile nothing: the tangent is a sum over pairs of charges."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add nothing: distant nodes act on each other, and the tangent is dense."""
 
-    def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
-        """Return the second derivative by u; collective.
+    def add_hessian(self, rows: Array, factor: float) -> None:
+        """Add factor D, this rank's part, to a matrix (3 local nodes, 3 all nodes); collective.
 
-        If `inexact`, it may be that of an earlier state. A term from `antisymmetric` returns the
-        derivative by odd changes.
+        A term from `antisymmetric` adds the derivative by odd changes, which move the images
+        oppositely.
         """
-        if self._even_term:
-            _, odd_hessian = self._even_term.even_and_odd_hessians(inexact=inexact)
-            return odd_hessian
-        even_hessian, _ = self.even_and_odd_hessians(inexact=inexact)
-        return even_hessian
+        even_term = self._even_term or self
+        even_term._stiffness().add_to(rows, factor, sign=-1.0 if self._even_term else 1.0)
 
-    def even_and_odd_hessians(
-        self, *, inexact: bool
-    ) -> tuple["InteractionHessian", "InteractionHessian"]:
-        """Return the second derivatives by even and by odd changes of u; collective.
+    def _stiffness(self) -> Stiffness:
+        """Return the second derivatives by u at the present state; collective.
 
-        Even changes move the images along as mirror images, odd ones oppositely. Both are computed
-        at the present state unless `inexact`: then the latest ones are returned, if there are any.
+        Those of the latest state are kept, and are nan if parts overlap.
         """
-        nodes = self._nodes()
-        latest = self._latest_hessians  # nodes, both second derivatives, and u there
-        # if `inexact`, those at any earlier nodes will do
-        if latest is not None and not inexact:
-            has_present_nodes = np.array_equal(nodes, latest[0])
-            latest = latest if has_present_nodes else None
-        if latest is None:
-            self._latest_hessians = None  # the old ones free their memory first
-            latest = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
-            self._latest_hessians = latest
-        _, even_and_odd, _ = latest
-        return even_and_odd
+        nodes, own_cells = self._nodes(), self._cells.own_range
+        if self._latest_stiffness is not None:
+            latest_nodes, stiffness = self._latest_stiffness
+            if np.array_equal(nodes, latest_nodes):
+                return stiffness
+        self._latest_stiffness = None  # the old ones free their memory first
+        dofmap = self._u.function_space.dofmap
+        index_map = dofmap.index_map
+        image_transforms = np.stack([image.Q for image in self._copies.images])
+        column_of = np.tile(self._cells.nodes, (len(image_transforms), 1)).astype(np.int64)
+        # nodes of images have columns of their own
+        column_of[len(self._cells.nodes) :] += index_map.size_global
+        # rows are local nodes of own cells; those of other ranks and of images are -1
+        row_of = np.full(column_of.shape, -1)
+        row_of[own_cells.start : own_cells.stop] = dofmap.list[: len(own_cells)]
+        shape = index_map.size_local + index_map.num_ghosts, index_map.size_global
+        stiffness = Stiffness(shape, self._scale, row_of, column_of, image_transforms)
+        try:
+            self._charges.evaluate(nodes, own_cells, stiffness)
+        except PartsTooNear:
+            stiffness.blocks[:] = np.nan
+        self._latest_stiffness = nodes, stiffness
+        return stiffness
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
@@ -385,73 +304,16 @@ class InteractionTerm:
         by the nodes of each cell: the one by a shared node is divided equally among its own cells.
         """
         V, count = self._u.function_space, len(self._cells.own_range)
-        D, v = self.hessian(), global_values(direction).ravel()
+        v = global_values(direction).ravel()
+        D = np.zeros((len(self._u.x.array), len(v)))
+        self.add_hessian(D, 1.0)
         _, gradient = self._evaluated()
-        # D v is the sum of the stored blocks' part and of the multipoles' part
-        by_nodes = energy * gradient + force * (D.near_blocks @ v + D.times_far(v[:, None]).ravel())
+        by_nodes = energy * gradient + force * (D @ v)
         nodes = V.dofmap.list[:count]
         # the number of own cells at each node; nodes of ghost cells alone are not used
         cells_of_node = np.bincount(nodes.ravel(), minlength=len(by_nodes) // 3)
         shares = by_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None]
         return np.asarray(shares[nodes])
-
-    def _hessians_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
-        """Return the second derivatives by even and odd changes of u; collective.
-
-        The deformed `nodes` (copies * cells, k, 3) are the same on all ranks. Near pairs of cells
-        fill stored blocks; others act by multipoles. Without images both are the same. The blocks
-        are nan if parts overlap.
-        """
-        own_cells, images, V = self._cells.own_range, self._copies.images, self._u.function_space
-        count, has_images = V.dofmap.index_map.size_global, len(images) > 1
-        column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
-        column_of[len(self._cells.nodes) :] += count  # nodes of images have columns of their own
-        # rows are local nodes of own cells; those of other ranks and of images are -1
-        row_of = np.full(column_of.shape, -1)
-        row_of[own_cells.start : own_cells.stop] = V.dofmap.list[: len(own_cells)]
-        image_transforms = np.stack([image.Q for image in images])
-        local_count = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
-        multipoles, near_cells = self._charges.boxes(nodes, own_cells)
-        # blocks of nodes of near cells are stored; those of adjacent cells serve extrapolation. A
-        # node of an image stands in the column of the modelled node
-        has_block = np.zeros((local_count, count), dtype=bool)
-        adjacent = np.zeros((count, count), dtype=bool)
-        modelled_column_of = column_of % count
-        _mark_blocks(has_block, row_of, modelled_column_of, own_cells, near_cells)
-        adjacent_cells = multipoles.adjacent_cells(own_cells)
-        _mark_blocks(adjacent, self._cells.nodes, modelled_column_of, own_cells, adjacent_cells)
-        # the same blocks on any number of ranks
-        self._comm.Allreduce(MPI.IN_PLACE, adjacent, MPI.LOR)
-        # second derivatives of near pairs of cells are added to the blocks
-        stiffness = Stiffness(has_block, self._scale, row_of, column_of, image_transforms)
-        try:
-            self._charges.evaluate(nodes, own_cells, stiffness)
-        except PartsTooNear:
-            stiffness.blocks[:] = np.nan
-        node_numbers = V.dofmap.index_map.local_to_global(np.arange(local_count, dtype=np.int32))
-        cells = CellNodes(
-            nodes=self._cells.nodes,
-            own=own_cells,
-            rows=row_of[own_cells.start : own_cells.stop],
-            numbers=node_numbers,
-            turn=image_transforms,
-        )
-        # the multipoles' part is not stored, but multiplied by means of these derivatives
-        multipole_jacobian = multipoles.jacobian(multipoles.place_charges(nodes))
-        even_hessian, odd_hessian = (
-            InteractionHessian(
-                near=stiffness,
-                far=multipoles,
-                B=multipole_jacobian,
-                scale=self._scale,
-                cells=cells,
-                sign=sign,
-                is_adjacent=adjacent[node_numbers][has_block],
-                block_rotation=self._turning,
-            )
-            for sign in ([1.0, -1.0] if has_images else [1.0, 1.0])
-        )
-        return even_hessian, odd_hessian
 
     def _evaluated(self) -> tuple[float, Array]:
         """Return this rank's part of the energy, and its gradient by local unknowns; collective.
@@ -472,17 +334,13 @@ class InteractionTerm:
         forces = np.zeros_like(self._u.x.array)
         np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(own_cells)], self._scale * gradient)
         self._evaluations.appendleft((nodes, self._scale * energy, forces))
-        # only forces that are finite on all ranks may be extrapolated
-        if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
-            self._extrapolation.add_state(global_values(self._u).ravel(), forces)
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
         """Return the deformed nodes (copies * cells, k, 3) over R of all cells; collective.
 
         As a side effect, results that depend on placement, remanence or thickness are forgotten if
-        one of these has changed since the last call: charges, evaluations, second derivatives and
-        forces for extrapolation.
+        one of these has changed since the last call: charges, evaluations and second derivatives.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
         # the inputs of the charges: placement, remanence, and perhaps the thickness, of all cells
@@ -496,35 +354,11 @@ class InteractionTerm:
             map(np.array_equal, inputs, self._inputs_of_charges)
         )
         if not are_unchanged:
-            self._inputs_of_charges, self._latest_hessians = inputs, None
+            self._inputs_of_charges, self._latest_stiffness = inputs, None
             self._evaluations.clear()
-            self._extrapolation = ForceExtrapolation(
-                self._blocks, self._rotations, is_single_rank=self._comm.size == 1
-            )
             for name in ("_charges", "_singular_pairs"):  # cached properties
                 self.__dict__.pop(name, None)
         return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
-
-    def _rotations(self, u: Array, u_before: Array) -> Array:
-        """Return the rotations of all nodes from the displacement `u_before` to u.
-
-        They are quaternions (nodes, 4), scalar last: the mean change of the cells' frames around a
-        node.
-        """
-        r0, nodes = global_values(self._model.r0), self._cells.nodes
-        element = self._u.function_space.element.basix_element
-        T = element.tabulate(1, element.points)[1:, :, :, 0]  # first derivatives at the nodes
-
-        def frames(u: Array) -> Array:
-            """Return tangents and normal as columns (cells, nodes, 3, 3), at a displacement."""
-            a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
-            return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
-
-        # sum over the cells at a node of the changes of their frames from `u_before` to u, which
-        # are deformation gradients; the rotation nearest to this sum is returned
-        F = np.zeros((len(r0), 3, 3))
-        np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(u_before)))
-        return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
     def _charges(self) -> InteractingCharges:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 AMPLITUDE = "interaction"
+MAX_UNKNOWNS = 9000  # of a model, whose tangent then has 650 MB
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,22 @@ def interaction(context: Context) -> Interaction | None:
         strength=magnetic.remanent.flux_density**2 / (MU_0 * E),
         itself=magnetic.interaction == "all",
     )
+
+
+def refuse_large(unknowns: int) -> None:
+    """Check that a model with an interaction is small enough for a tangent with all entries.
+
+    Raises
+    ------
+    CaseError
+        With the number of unknowns that is allowed.
+    """
+    if unknowns > MAX_UNKNOWNS:
+        raise CaseError(
+            f"magnetic.interaction: the model has {unknowns} unknowns; as all of them act on "
+            f"each other, at most {MAX_UNKNOWNS} are allowed: take a coarser mesh or a lower "
+            "mesh.degree"
+        )
 
 
 def refuse_unfit_interaction(context: Context) -> None:

@@ -1,7 +1,7 @@
 """Sums over pairs of charged cells, in C: energy, gradient and second derivatives.
 
-The C functions are in pairs.c, multipole_expansion.c and stacked_faces.c, which are compiled
-together and work at `LANES` pairs at once. Lengths are over R, charges over Br R², energies over
+The C functions are in pairs.c, pair_rules.c and stacked_faces.c, which are compiled together and
+work at `LANES` pairs at once. Lengths are over R, charges over Br R², energies over
 Br² R³/(4 pi mu_0).
 
 Charges are at points of elements, in layers through the thickness: a charge of height eta is at
@@ -9,8 +9,8 @@ r + eta t n, with the mid-surface place r, its normal n and the thickness t. So 
 cell's k nodes come from those by r and n. They are summed at points first (`Points.sums`), then at
 nodes (`Pairs.finish`). Copies are the modelled cells and their images, which make the whole shell;
 cells of all copies are numbered copy by copy. A rule is a set of quadrature points; distant cells
-have rules with few points. Boxes, moments and expansions are those of `multipole_expansion`,
-stacked cells those of `stacked_faces`. Functions in C take pointers to contiguous arrays.
+have rules with few points. Stacked cells are those of `stacked_faces`. Functions in C take pointers
+to contiguous arrays.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array
 
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.platform.native import load_native
@@ -41,8 +40,6 @@ FUNCTIONS = """
     int64_t rules(int64_t, int64_t, int64_t, int64_t, const double *, const double *,
         const double *, const double *, const uint8_t *, double, double, double, double, int64_t,
         const double *, double, int8_t *);
-    void translate(int64_t, const int64_t *, const int64_t *, const int64_t *, int64_t,
-        const int64_t *, int64_t, int64_t, const double *, const double *, double *);
     typedef struct { int64_t k, degree; const double *shape; int64_t of_charges, S;
         const double *charges, *thickness, *heights; int64_t P; const double *T, *X, *weights,
         *gauss; double h, depth, least, inside, precision; } Cells;
@@ -53,7 +50,7 @@ FUNCTIONS = """
         double *, double *, double *);
 """
 C_TYPES = {np.dtype(name): f"{name}_t[]" for name in ("int64", "int32", "uint8", "int8")}
-C_TYPES |= {np.dtype(np.float64): "double[]", np.dtype(np.float32): "float[]"}
+C_TYPES[np.dtype(np.float64)] = "double[]"
 # arrays to which a struct in C points, for as long as it is used
 ARRAYS_OF_STRUCTS: WeakKeyDictionary[Any, dict[str, Array]] = WeakKeyDictionary()
 
@@ -129,15 +126,15 @@ class Points:
 
 
 class Stiffness:
-    """Blocks (3, 3) of a matrix between nodes, to which second derivatives are added.
+    """Blocks (3, 3) of a matrix between all nodes, to which second derivatives are added.
 
     Second derivatives by two nodes of one cell are first summed for each cell, in `onto`; the
     method `finish` adds these sums to the blocks.
 
     Parameters
     ----------
-    pattern
-        (local nodes, all nodes) whether there is a block.
+    shape
+        Numbers of local nodes and of all nodes.
     factor
         Factor of all second derivatives.
     row_of, column_of
@@ -149,35 +146,25 @@ class Stiffness:
     Attributes
     ----------
     blocks
-        (n, 3, 3) row by row; then those of images.
+        (1 or 2, local nodes, all nodes, 3, 3): derivatives by the modelled nodes; then by those of
+        all images, if there are images.
     where
-        (local nodes, all nodes and those of images) number of each block, or -1.
-    starts, columns
-        First block of each row, and the column of each block.
+        (local nodes, all nodes and those of images) number of each block.
     onto
         (cells, k (k + 1)/2, 3, 3) sums of second derivatives by two nodes of the same cell, for
         each pair of its nodes in the upper triangle.
-    _count
-        Number of blocks of the pattern, without those of images.
     """
 
     def __init__(
-        self, pattern: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array
+        self, shape: tuple[int, int], factor: float, row_of: Ints, column_of: Ints, turn: Array
     ) -> None:
         """Number the blocks and set them to zero; parameters are those of the class."""
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
-        # blocks are numbered row by row; -1 where there is none
-        numbers = np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1
-        block_numbers = np.where(pattern, numbers, -1).astype(np.int32)
-        self._count = int(np.count_nonzero(pattern))
-        self.columns = np.nonzero(pattern)[1].astype(np.int32)
-        blocks_of_rows = np.count_nonzero(pattern, axis=1)
-        self.starts = np.concatenate([[0], np.cumsum(blocks_of_rows)]).astype(np.int32)
-        self.shape = 3 * pattern.shape[0], 3 * pattern.shape[1]
-        # images have one more set of blocks, so that `matrix` can give it a sign
-        image_block_numbers = [block_numbers + self._count] if len(turn) > 1 else []
-        self.where = np.concatenate([block_numbers, *image_block_numbers], axis=1)
-        self.blocks = np.zeros((self._count * (1 + len(image_block_numbers)), 3, 3))
+        # images have one more set of blocks, so that `add_to` can give it a sign
+        sets = min(len(turn), 2)
+        numbers = np.arange(sets * shape[0] * shape[1], dtype=np.int32).reshape(sets, *shape)
+        self.where = np.concatenate(numbers, axis=1)
+        self.blocks = np.zeros((sets, *shape, 3, 3))
         self.turn = np.ascontiguousarray(turn)
         cells, k = row_of.shape
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
@@ -195,17 +182,20 @@ class Stiffness:
             blocks_of_cell[a, b] = sums
             rows, columns = self.row_of[cell], self.column_of[cell]
             block_numbers = self.where[rows[:, None], columns]  # (k, k)
-            self.blocks[block_numbers] += blocks_of_cell
+            self.blocks.reshape(-1, 3, 3)[block_numbers] += blocks_of_cell
 
-    def matrix(self, sign: float) -> bsr_array:
-        """Return the matrix (3 local nodes, 3 all nodes).
+    def add_to(self, matrix: Array, factor: float, sign: float) -> None:
+        """Add a multiple of the second derivatives to a matrix (3 local nodes, 3 all nodes).
 
         Blocks of images are added times `sign`: -1 for displacements that are opposite in images.
         """
-        blocks, blocks_of_images = self.blocks[: self._count], self.blocks[self._count :]
-        if len(blocks_of_images):
-            blocks = blocks + sign * blocks_of_images
-        return bsr_array((blocks, self.columns, self.starts), self.shape)
+        rows, columns = self.blocks.shape[1:3]
+        # row by row, so that no second array of this size is needed
+        for i, row in enumerate(matrix.reshape(rows, 3, columns, 3)):
+            blocks, *blocks_of_images = self.blocks[:, i]
+            for blocks_of_image in blocks_of_images:
+                blocks = blocks + sign * blocks_of_image
+            row += factor * blocks.transpose(1, 0, 2)
 
 
 @dataclass(frozen=True)
@@ -241,7 +231,7 @@ class Pairs:
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
-        names = "pairs.c", "multipole_expansion.c", "stacked_faces.c"
+        names = "pairs.c", "pair_rules.c", "stacked_faces.c"
         source, *further_sources = (Path(__file__).with_name(name) for name in names)
         self._ffi, self._lib = load_native(source, FUNCTIONS, comm, *further_sources)
 
@@ -460,40 +450,6 @@ class Pairs:
             p(rule_numbers),
         )
         return None if too_near else rule_numbers
-
-    def translate(
-        self,
-        receiving_boxes: Ints,
-        acting_boxes: Ints,
-        which: Ints,
-        ends: Ints,
-        G: Array,
-        M: Array,
-        L: Array,
-    ) -> None:
-        """Add the translated moments M of acting boxes to the expansions L of receiving boxes.
-
-        An expansion gives the potential of distant charges in a box; see `multipole_expansion`.
-
-        Parameters
-        ----------
-        receiving_boxes, acting_boxes
-            (pairs,) numbers of boxes.
-        which
-            (pairs,) row of G of each pair.
-        ends
-            Number of entries of each row of a translation matrix that are not zero.
-        G
-            (matrices, sum of ends) these entries.
-        M, L
-            (boxes, COUNT, n) moments and expansions.
-        """
-        if not len(receiving_boxes):
-            return
-        p, G, M = self._pointer, np.ascontiguousarray(G), np.ascontiguousarray(M)
-        box_numbers = p(receiving_boxes), p(acting_boxes), p(which)
-        size_arguments = M.shape[1], p(ends), G.shape[1], M.shape[2]
-        self._lib.translate(len(receiving_boxes), *box_numbers, *size_arguments, p(G), p(M), p(L))
 
     def _pointer(self, array: NDArray[Any]) -> Any:
         """Return a C pointer to a contiguous array."""

@@ -22,7 +22,7 @@ from magshell_fenicsx.continuation.system import State, Vector, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.magnetism import interacting
+from magshell_fenicsx.parts.magnetism import interacting, interaction
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
@@ -196,8 +196,8 @@ def test_derivatives(bent: tuple[Scene, Vector]) -> None:
     moved = [(w / step, u + k * step * v) for k, w in ways]
     slope = sum(w * system.at_state(State(each, mu)).evaluate(term.energy) for w, each in moved)
     assert slope == pytest.approx(gradient(scene, u) @ v, rel=1e-6)
-    matrix = DenseTangent(system.u.function_space, system.clamped)
-    rows = system.at_state(State(u, mu)).evaluate(lambda: matrix.rows(term))
+    matrix = DenseTangent(system.u.function_space, [term], system.clamped)
+    rows = system.at_state(State(u, mu)).evaluate(lambda: matrix.rows(mu))
     change = sum(w * gradient(scene, each) for w, each in moved)
     assert np.linalg.norm(rows @ v - change) < 1e-6 * np.linalg.norm(change)
     assert np.abs(rows - rows.T).max() < 1e-12 * np.abs(rows).max()
@@ -414,12 +414,13 @@ def test_a_step_without_interaction_is_refused(model: Any, tmp_path: Path) -> No
 def test_models_that_are_too_large(
     model: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(interacting, "MAX_UNKNOWNS", 100)
+    monkeypatch.setattr(interaction, "MAX_UNKNOWNS", 100)
     strips(tmp_path / "strips.msh", 2.0, 1.0, 1.0, 0.5)
-    with pytest.raises(
-        CaseError, match="as all of them act on each other, at most 100 are allowed"
-    ):
-        Scene(case_of(tmp_path / "strips.msh", 0.1))
+    for refused in (Scene, describe):
+        with pytest.raises(
+            CaseError, match="as all of them act on each other, at most 100 are allowed"
+        ):
+            refused(case_of(tmp_path / "strips.msh", 0.1))
 
 
 def test_a_piece_that_is_not_held(model: Any, tmp_path: Path) -> None:
@@ -723,7 +724,7 @@ def test_close_faces_have_an_energy_down_to_contact(model: Any, tmp_path: Path, 
     assert (energies[0] - energies[1]) / (2 * step) == pytest.approx(
         gradient(scene, u) @ v, rel=1e-5
     )
-    acting = system.at_state(State(u, mu)).evaluate(term.hessian)
-    bend = v @ (acting.near_blocks @ v + acting.times_far(v[:, None]).ravel())
+    matrix = DenseTangent(system.u.function_space, [term], system.clamped)
+    bend = v @ system.at_state(State(u, mu)).evaluate(lambda: matrix.rows(mu)) @ v
     slopes = [gradient(scene, each) @ v for each in sides]
     assert (slopes[0] - slopes[1]) / (2 * step) == pytest.approx(bend, rel=2e-3)

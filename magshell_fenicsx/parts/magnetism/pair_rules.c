@@ -1,4 +1,4 @@
-/* Which rule each pair of cells that are apart has, and multipoles of boxes far from each other. Compiled behind pairs.c. */
+/* Which rule each pair of cells that are apart has. Compiled behind pairs.c. */
 
 /* The number of the rule of each pair of a cell from `first` to `last` with any of n, where `apart` (own, n) is not 0; -1
    of the others. nodes (n, k, 3), centre (n, 3), normal (n, 3), radius (n,). Rules have the rates `least` (rules,): the
@@ -54,36 +54,4 @@ FAST int64_t rules(int64_t n, int64_t first, int64_t last, int64_t k, const doub
             *to = (int8_t)which;
         }
     return 0;
-}
-
-/* Add G M of boxes `other` to L of boxes `one`, for pairs (count,); G (.., size): row after row (one for each number of M)
-   the first `ends` (n,), all that are not zero; M and L (boxes, n, width). Of width 1, LANES successive pairs with one G go
-   through at once. */
-FAST void translate(int64_t count, const int64_t *one, const int64_t *other, const int64_t *which, int64_t n,
-                    const int64_t *ends, int64_t size, int64_t width, const double *G, const double *M, double *L)
-{
-    v m[n], l[n];
-    for (int64_t at = 0, lanes; at < count; at += lanes) {
-        const double *g = G + which[at] * size;
-        lanes = 1;
-        if (width > 1) {
-            for (int64_t j = 0; j < n; g += ends[j++])
-                for (int64_t i = 0; i < ends[j]; ++i)
-                    for (int64_t k = 0; k < width; ++k)
-                        L[(one[at] * n + i) * width + k] += g[i] * M[(other[at] * n + j) * width + k];
-            continue;
-        }
-        while (lanes < LANES && at + lanes < count && which[at + lanes] == which[at])
-            ++lanes;
-        memset(m, 0, sizeof m), memset(l, 0, sizeof l);
-        for (int64_t c = 0; c < lanes; ++c)
-            for (int64_t j = 0; j < n; ++j)
-                m[j][c] = M[other[at + c] * n + j];
-        for (int64_t j = 0; j < n; g += ends[j++])
-            for (int64_t i = 0; i < ends[j]; ++i)
-                l[i] += g[i] * m[j];
-        for (int64_t c = 0; c < lanes; ++c)
-            for (int64_t i = 0; i < n; ++i)
-                L[one[at + c] * n + i] += l[i][c];
-    }
 }
