@@ -291,8 +291,7 @@ class ResultSampler:
                 self._records.append(record)
                 if places_ahead and record.step == last_step:
                     places_ahead -= self._just_passed(places_ahead)
-                is_complete = not places_ahead and not to_end
-                if record.step == last_step and is_complete:
+                if not places_ahead and not to_end:
                     break
         except Stopped as e:
             self._stop_reason = str(e)

@@ -68,6 +68,17 @@ def test_second_order_towards_scipy(rho: float, drag: float) -> None:
     assert (4 * found[1] - found[0]) / 3 == pytest.approx(exact, abs=1e-6)
 
 
+def test_a_motion_begins_with_the_acceleration_of_all_forces() -> None:
+    """The acceleration of a motion that begins at a speed is that of Newton's second law, with the
+    forces of the energy and of the drag.
+    """
+    drag, speed = 0.5, np.array([0.2, -0.3])
+    toy, integrator = column(1.0, drag)
+    motion = integrator.begin(0.7, START, speed)
+    forces = -toy.residual(START, {"load": load(0.7)}) - drag * MASS @ speed
+    assert motion.a == pytest.approx(np.linalg.solve(MASS, forces), rel=1e-12)
+
+
 def test_same_motion_as_petsc() -> None:
     """TSALPHA2 with the same steps and parameters; its first acceleration is of first order."""
     toy, integrator = column(0.5)

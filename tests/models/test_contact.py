@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.gap import penalty
+from magshell_fenicsx.simulate.contacts_in_time import ContactsInTime
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
@@ -90,6 +92,40 @@ def test_derivatives(kind: str) -> None:
     for number, (first, second) in enumerate(zip(*changed, strict=True)):
         least = 1e-3 if number else 1e-7  # of the tangent the shell's own stiffness stays
         assert np.abs(first - second).max() > least * np.abs(first).max()
+
+
+@pytest.mark.parametrize("kind", ["meridian", "full"])
+def test_derivative_of_the_mean_force_of_a_step_in_time(kind: str) -> None:
+    """Central differences by the displacement within the step at which forces are taken: 2e-4. The
+    tangent is symmetric: it takes the mean normal of the step for that at its end.
+    """
+    model = scene(kind).model
+    system, part = model.system, 0.6
+    bodies = {name: contact for name, (contact, _) in model.contacts.items()}
+    contacts = ContactsInTime(system, bodies, [])
+    mu = dict.fromkeys(scene(kind).unloaded().mu, 0.4)
+    rng = np.random.default_rng(5)
+    begin, u, v = (
+        system.zero_at_supports(size * model.material.h * rng.standard_normal(system.size))
+        for size in (0.01, 0.01, 1e-6)
+    )
+
+    def average_with(displacement: Array) -> None:
+        end = begin + (displacement - begin) / part
+        contacts.average_along(State(begin, mu), State(end, mu), part)
+
+    average_with(u)
+    K = system.tangent(u, mu)
+    direction = K.createVecRight()
+    direction.array[:] = v
+    Kv = (K * direction).array * (system.zero_at_supports(np.ones(system.size)) != 0)
+    residuals = []
+    for displacement in (u - v / 2, u + v / 2):
+        average_with(displacement)
+        residuals.append(system.residual(displacement, mu))
+    contacts.use_state_forces()
+    low, high = residuals
+    assert np.abs(high - low - Kv).max() < 2e-4 * np.abs(Kv).max()
 
 
 @pytest.mark.parametrize("kind", ["meridian", "full"])

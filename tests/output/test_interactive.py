@@ -103,6 +103,7 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
     assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a) >= 0).all()  # all outwards
     fields = {field["name"]: field for field in about["fields"]}
     assert {"w_over_h", "E_1", "E_2", "M_1", "M_2", "couple", "p_mag"} <= fields.keys()
+    assert not {"gap_over_h", "contact_pressure"} & fields.keys()  # nothing touches
     expected = {"M_1": surface.fields["M_1"], "couple": np.linalg.norm(couple(surface), axis=1)}  # type: ignore[arg-type]
     for name, values in expected.items():
         field = fields[name]

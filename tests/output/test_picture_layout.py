@@ -16,7 +16,7 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.bodies_and_magnets import far_bodies_note
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.colours import contact_region, moments
-from magshell_fenicsx.output.pictures.layout import Arrow, Panel
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel, panels_figure
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.rendering import (
     Camera,
@@ -128,6 +128,17 @@ def test_arrows_stay_in_their_panel() -> None:
     assert (left, right, low) == (-1, 1, -1)
     assert 1.5 < high < 1.6
     assert panel.size == pytest.approx((100 * (high + 1) / 2, 100))
+
+
+def test_panels_are_in_the_middle_of_equal_columns() -> None:
+    """Two panels, one half as wide as the other."""
+    panels = [
+        Panel(np.zeros((100, width, 4), np.uint8), Window((-1.0, 1.0, -1.0, 1.0), 50), ABOVE)
+        for width in (100, 50)
+    ]
+    figure = panels_figure(panels, OutputSection())
+    boxes = [axes.get_position() for axes in figure.axes[:2]]
+    assert [(box.x0 + box.x1) / 2 for box in boxes] == pytest.approx([0.25, 0.75], abs=1e-3)
 
 
 def test_moments_that_are_noise_are_pale() -> None:

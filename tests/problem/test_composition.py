@@ -140,6 +140,19 @@ def test_a_strip_bent_by_its_tip(symmetry: str, load: dict[str, Any]) -> None:
     assert end(asked)["A_uz"] == pytest.approx(1e-4, rel=1e-2)
 
 
+def test_a_tip_is_moved_by_its_force_as_far_as_asked() -> None:
+    loads = [{"at": "A", "force": [0, 0, 1.0]}]
+    asked = case(
+        "strip",
+        points={"A": [1.0, 0.0, 0.0]},
+        loading={"kind": "dead", "loads": loads, "displacement": 1e-3, "points": 1},
+        mesh={"degree": 3, "size": 0.1},
+    )
+    row = end(asked)
+    assert row["A_uz"] == pytest.approx(1e-3, rel=1e-9)
+    assert row["w_over_h"] * H == pytest.approx(1e-3, rel=1e-9)
+
+
 def test_a_field_to_the_left_bends_a_strip_as_it_does_the_whole_strip() -> None:
     """The mirror plane y = 0 has the azimuths 0 and 180; a strip lies along e1 with either."""
     field = {"lambda_m": 1e-5, "applied": {"polar": 60, "azimuth": 180}}

@@ -97,3 +97,16 @@ def test_force_has_the_load_vector_of_its_work() -> None:
         assert -load.reshape(-1, 3).sum(axis=0) == pytest.approx(
             model.force_unit * inward, rel=1e-12, abs=1e-15
         )
+
+
+def test_the_force_of_a_patch_is_within_its_radius() -> None:
+    """The weight (1 - d²/a²)² has the mean square distance a²/4, on a sphere too, where the area
+    within a distance d of a point is pi d².
+    """
+    model = ShellModel(
+        hemisphere(), Material(0.3, 0.05), 2, {}, Loads(forces={"force": Force("load", patch=0.7)})
+    )
+    inward = -model.normals["load"]
+    forces = -model.system.load(model.zero(), {}, "force").reshape(-1, 3) @ inward
+    square_distances = 2 + 2 * model.r0.x.array.reshape(-1, 3) @ inward  # from the point -inward
+    assert forces @ square_distances / forces.sum() == pytest.approx(0.7**2 / 4, rel=1e-2)

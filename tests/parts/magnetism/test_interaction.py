@@ -184,6 +184,15 @@ def bent(model: Any, tmp_path: Path) -> tuple[Scene, Vector]:
     )
 
 
+def test_forces_do_not_depend_on_the_place(model: Any, tmp_path: Path) -> None:
+    """Two discs, and the same ones moved together."""
+    discs(tmp_path / "discs.msh", 2.5, 0.4, 2.5)
+    scene = Scene(case_of(tmp_path / "discs.msh", 0.2))
+    moved = np.tile([3.0, -2.0, 5.0], scene.model.system.size // 3)
+    forces, expected = gradient(scene, moved), gradient(scene, scene.model.zero())
+    assert np.abs(forces - expected).max() < 1e-8 * np.abs(expected).max()
+
+
 def test_derivatives(bent: tuple[Scene, Vector]) -> None:
     """Forces are the slope of the energy, the tangent is that of the forces, symmetric:
     differences, 1e-6.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import CASES
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
@@ -258,6 +259,44 @@ def test_a_stretched_disc_of_rubber(law: str) -> None:
     half, rim, size = h / 2.25 / 2, 1.5 * R, 1 / 2.25 if law == "deformation" else 1.0
     up, down = ((z + way * half) / np.hypot(z + way * half, rim) for way in (1, -1))
     assert found == pytest.approx(size * (up - down) / 2, rel=1e-7)
+
+
+def test_a_strip_that_turns_takes_its_remanence_along() -> None:
+    """Without strain both laws give one field, which a sensor that turns along reads unchanged."""
+    strip = {
+        "geometry": "plate",
+        "length": "10 mm",
+        "width": "2 mm",
+        "thickness": "0.2 mm",
+        "youngs_modulus": "1 MPa",
+        "poisson_ratio": 0.5,
+    }
+    turn = Rotation.from_euler("z", 90, degrees=True)
+    place = np.array([3.0, 2.0, 1.0])
+    fields = []
+    for law, turned in (("deformation", False), ("rotation", False), ("rotation", True)):
+        x, y, z = (float(component) for component in (turn.apply(place) if turned else place))
+        case = {
+            "shell": strip,
+            "boundary": {"left": "clamped"},
+            "symmetry": "none",
+            "magnetic": {
+                "remanent": {"polar": 70, "azimuth": 20, "flux_density": "1 T"},
+                "applied": {"flux_density": "1 mT"},
+                "remanence": law,
+            },
+            "sensors": {"hall": {"position": [f"{x} mm", f"{y} mm", f"{z} mm"]}},
+            "loading": {"kind": "field"},
+        }
+        scene = Scene(Case.from_source(case))
+        r0 = scene.model.r0.x.array[: scene.model.system.size].reshape(-1, 3)
+        u = turn.apply(r0) - r0 if turned else 0 * r0
+        row = scene.observe(State(u.ravel(), scene.unloaded().mu))
+        field_at_sensor = np.array([row[f"hall_B{axis}"] for axis in "xyz"])
+        fields.append(turn.inv().apply(field_at_sensor) if turned else field_at_sensor)
+    expected, *others = fields
+    for other in others:
+        assert other == pytest.approx(expected, rel=1e-7)
 
 
 @cache
