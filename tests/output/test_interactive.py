@@ -32,7 +32,7 @@ from magshell_fenicsx.output.pictures.lines import (
 from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.report.interactive import chosen_frames, plotly, simplify
 from magshell_fenicsx.output.report.report import open_in_browser, report_of, write_report
-from magshell_fenicsx.output.store.checkpoint import identity, refuse_other_case
+from magshell_fenicsx.output.store.run_identity import identity, refuse_other_case
 from magshell_fenicsx.output.store.table import read_rows, write_csv
 
 needs_plotly = pytest.mark.skipif(plotly() is None, reason="Plotly is not installed")

@@ -11,7 +11,7 @@ from command import magshell, read_path
 from conftest import CASES, draw_nothing
 from interrupted import check_same_path
 
-from magshell_fenicsx.output.store.checkpoint import framed
+from magshell_fenicsx.output.store.journal_file import framed
 from magshell_fenicsx.runs.running import Watch
 
 CASE = (CASES / "dimple_buckling.yaml", "--set=mesh={refinement: 0.3, degree: 2}")
