@@ -36,6 +36,7 @@ from magshell_fenicsx.output.fields.outlines import (
 from magshell_fenicsx.output.fields.surface import completed_by_symmetry, rotated_surface
 from magshell_fenicsx.output.fields.vtu import FieldSeries, ShellData, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import read_run, terminal_text, verdict
+from magshell_fenicsx.output.store import run_identity
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import (
     UNFINISHED,
@@ -57,18 +58,7 @@ from magshell_fenicsx.output.store.manifest import (
     write_manifest,
 )
 from magshell_fenicsx.output.store.manifest import NAME as MANIFEST
-from magshell_fenicsx.output.store.run_identity import (
-    CASE_FILE,
-    CHECKPOINT,
-    NEW_CHECKPOINT,
-    SUMMARY,
-    belongs_to,
-    check_resumable,
-    identity_in,
-    is_replacement_unfinished,
-    refuse_other_case,
-    stored_identity,
-)
+from magshell_fenicsx.output.store.run_identity import CHECKPOINT, NEW_CHECKPOINT, SUMMARY
 from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
 from magshell_fenicsx.parts.registered import OBSERVABLES
@@ -147,14 +137,14 @@ def _refuse_other_case(out: Path, document: Document) -> None:
     A run may replace one of an equal case, and one of a file of the same name with other values.
     """
     try:
-        identity = stored_identity(out, document.outside)
+        identity = run_identity.stored_identity(out, document.outside)
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
-    name = identity.get(CASE_FILE)
+    name = identity.get(run_identity.CASE_FILE)
     # a file of the same name: the user has changed the case, and repeats its run
     if not name or Path(name).stem == Path(document.name).stem:
         return
-    if not belongs_to(identity, document):
+    if not run_identity.belongs_to(identity, document):
         raise CaseError(
             f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite"
         )
@@ -165,7 +155,7 @@ def _refuse_interrupted(out: Path) -> None:
 
     A run that has ended may be repeated, also one whose solver could not go on.
     """
-    if is_replacement_unfinished(out):
+    if run_identity.is_replacement_unfinished(out):
         return
     # without a checkpoint, or without results that took long, nothing would be lost
     file, table = out / CHECKPOINT, out / "path.csv"
@@ -198,7 +188,7 @@ def _check_resumable(out: Path, document: Document) -> None:
         If the run is complete.
     """
     file = out / CHECKPOINT
-    if is_replacement_unfinished(out):
+    if run_identity.is_replacement_unfinished(out):
         raise CaseError(
             f"--resume: {out}: a new run was interrupted while it removed the files of the earlier "
             "one; start again without --resume, or with --overwrite"
@@ -208,7 +198,7 @@ def _check_resumable(out: Path, document: Document) -> None:
         if summary["stopped"] is None:  # it has reached its target
             _check_complete(out, summary, document)
             raise AlreadyComplete(summary)
-    check_resumable(file, document)
+    run_identity.check_resumable(file, document)
 
 
 def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> None:
@@ -222,7 +212,9 @@ def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> N
         If a file is missing or cut off.
     """
     version = {"version": summary["versions"]["magshell_fenicsx"]}  # of a run without `sources`
-    refuse_other_case(version | stored_identity(out, document.outside), document, out)
+    run_identity.refuse_other_case(
+        version | run_identity.stored_identity(out, document.outside), document, out
+    )
     try:
         _, rows = read_run(out)
         points = len(rows)
@@ -356,7 +348,7 @@ class RunFiles:
             Rows of path.csv that the interrupted run has written; empty for a new run.
         """
         # what summary.json takes from the checkpoint; it has the case and the version itself
-        identity = identity_in(self._folder / CHECKPOINT) or {}
+        identity = run_identity.identity_in(self._folder / CHECKPOINT) or {}
         self._origin = {
             key: value for key, value in identity.items() if key not in ("case", "version")
         }

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from magshell_fenicsx.output.pictures.picture import PICTURES
+from magshell_fenicsx.output.store import run_identity
 from magshell_fenicsx.output.store.durable import (
     UNFINISHED,
     Damaged,
@@ -21,13 +22,7 @@ from magshell_fenicsx.output.store.durable import (
     write_whole,
 )
 from magshell_fenicsx.output.store.folder import refuse_foreign
-from magshell_fenicsx.output.store.run_identity import (
-    CHECKPOINT,
-    NEW_CHECKPOINT,
-    SUMMARY,
-    identity_in,
-    is_replacement_unfinished,
-)
+from magshell_fenicsx.output.store.run_identity import CHECKPOINT, NEW_CHECKPOINT, SUMMARY
 from magshell_fenicsx.output.store.table import is_path
 
 NAME = "written.txt"
@@ -91,7 +86,7 @@ def files_of_runs(folder: Path) -> set[str]:
     }
     # files that a killed run has left
     names = {name for name in regular_names if name.endswith(UNFINISHED)}
-    if is_replacement_unfinished(folder):
+    if run_identity.is_replacement_unfinished(folder):
         names.add(NEW_CHECKPOINT)
     # files in the manifest
     text = read_result(folder / NAME).decode(errors="replace") if NAME in regular_names else ""
@@ -100,7 +95,7 @@ def files_of_runs(folder: Path) -> set[str]:
     elif _is_of_run(lambda: read_object(folder / SUMMARY)):  # of an earlier version
         return regular_names
     # files of a path; the manifest's own name is in `names` if there is a manifest
-    has_checkpoint = _is_of_run(lambda: identity_in(folder / CHECKPOINT))
+    has_checkpoint = _is_of_run(lambda: run_identity.identity_in(folder / CHECKPOINT))
     has_manifest = NAME in names
     has_files_of_path = has_checkpoint
     if not has_checkpoint and not has_manifest:
