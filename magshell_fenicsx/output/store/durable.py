@@ -40,8 +40,9 @@ def damage(file: Path, reason: str, *, may_be_earlier: bool = False) -> Damaged:
     may_be_earlier
         Whether an earlier version may have written such a file.
     """
-    earlier = ", or of an earlier version" if may_be_earlier else ""
-    return Damaged(f"{file}: is damaged{earlier}: {reason}")
+    if may_be_earlier:
+        return Damaged(f"{file}: is damaged, or of an earlier version: {reason}")
+    return Damaged(f"{file}: is damaged: {reason}")
 
 
 @contextmanager
