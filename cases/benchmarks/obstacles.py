@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.pictures.lines import smooth
-from magshell_fenicsx.output.store.checkpoint import OtherSources
 from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.run_identity import OtherSources
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
 

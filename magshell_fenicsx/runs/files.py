@@ -36,27 +36,30 @@ from magshell_fenicsx.output.fields.outlines import (
 from magshell_fenicsx.output.fields.surface import completed_by_symmetry, rotated_surface
 from magshell_fenicsx.output.fields.vtu import FieldSeries, ShellData, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import read_run, terminal_text, verdict
-from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store import run_identity
+from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import (
+    UNFINISHED,
     Damaged,
+    damage,
     read_object,
     read_result,
     sync_folder,
+    write_object,
     write_whole,
 )
 from magshell_fenicsx.output.store.folder import DiskError, access_disk, prepare_folder
 from magshell_fenicsx.output.store.manifest import (
     FILES_OF_PATH,
     MESH,
-    NEW_CHECKPOINT,
     files_of_runs,
-    is_replacement_unfinished,
     refuse_unwritten,
     remove,
     write_manifest,
 )
 from magshell_fenicsx.output.store.manifest import NAME as MANIFEST
-from magshell_fenicsx.output.store.stored_results import SUMMARY, read_summary
+from magshell_fenicsx.output.store.run_identity import CHECKPOINT, NEW_CHECKPOINT, SUMMARY
+from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.problem.problem import Document
@@ -64,6 +67,7 @@ from magshell_fenicsx.simulate.scene import Scene
 
 INTERRUPTION = re.compile(r"^interrupted by |cannot be (written|read): ")
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9  # of recomputed values in path.csv
+CUT_OFF = "it is cut off, or missing"
 COMPARED_COLUMNS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
@@ -133,37 +137,17 @@ def _refuse_other_case(out: Path, document: Document) -> None:
     A run may replace one of an equal case, and one of a file of the same name with other values.
     """
     try:
-        identity = identity_of_run(out, document)
+        identity = run_identity.stored_identity(out, document.outside)
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
-    name = identity.get(checkpoint.CASE_FILE)
+    name = identity.get(run_identity.CASE_FILE)
     # a file of the same name: the user has changed the case, and repeats its run
     if not name or Path(name).stem == Path(document.name).stem:
         return
-    if not checkpoint.belongs_to(identity, document):
+    if not run_identity.belongs_to(identity, document):
         raise CaseError(
             f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite"
         )
-
-
-def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
-    """Return what the run in a folder depends on: the case, and hashes of files and sources.
-
-    The keys are those of a checkpoint. Empty without checkpoint and summary.json.
-
-    Raises
-    ------
-    Damaged
-        If the checkpoint or summary.json cannot be read.
-    """
-    if is_replacement_unfinished(out):  # what is left of the earlier run is no run
-        return checkpoint.identity_in(out / NEW_CHECKPOINT) or {}
-    if identity := checkpoint.identity_in(out / checkpoint.NAME):
-        return identity
-    # a complete run has no checkpoint any more
-    summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
-    keys = "case", checkpoint.CASE_FILE, *document.outside
-    return {key: summary[key] for key in keys if key in summary}
 
 
 def _refuse_interrupted(out: Path) -> None:
@@ -171,10 +155,10 @@ def _refuse_interrupted(out: Path) -> None:
 
     A run that has ended may be repeated, also one whose solver could not go on.
     """
-    if is_replacement_unfinished(out):
+    if run_identity.is_replacement_unfinished(out):
         return
     # without a checkpoint, or without results that took long, nothing would be lost
-    file, table = out / checkpoint.NAME, out / "path.csv"
+    file, table = out / CHECKPOINT, out / "path.csv"
     points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0  # but the header
     has_results = points >= 2 or (out / MESH).exists()  # the undeformed shell alone is no loss
     if not file.exists() or not has_results:
@@ -203,8 +187,8 @@ def _check_resumable(out: Path, document: Document) -> None:
     AlreadyComplete
         If the run is complete.
     """
-    file = out / checkpoint.NAME
-    if is_replacement_unfinished(out):
+    file = out / CHECKPOINT
+    if run_identity.is_replacement_unfinished(out):
         raise CaseError(
             f"--resume: {out}: a new run was interrupted while it removed the files of the earlier "
             "one; start again without --resume, or with --overwrite"
@@ -214,7 +198,7 @@ def _check_resumable(out: Path, document: Document) -> None:
         if summary["stopped"] is None:  # it has reached its target
             _check_complete(out, summary, document)
             raise AlreadyComplete(summary)
-    checkpoint.check_resumable(file, document)
+    run_identity.check_resumable(file, document)
 
 
 def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> None:
@@ -227,19 +211,19 @@ def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> N
     Damaged
         If a file is missing or cut off.
     """
-    saved_identity = {"version": summary["versions"]["magshell_fenicsx"]}
-    keys = "case", "sources", *document.outside
-    saved_identity |= {key: summary[key] for key in keys if key in summary}
-    checkpoint.refuse_other_case(saved_identity, document, out)
+    version = {"version": summary["versions"]["magshell_fenicsx"]}  # of a run without `sources`
+    run_identity.refuse_other_case(
+        version | run_identity.stored_identity(out, document.outside), document, out
+    )
     try:
         _, rows = read_run(out)
         points = len(rows)
     except FileNotFoundError as e:
-        raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
+        raise damage(e.filename, CUT_OFF) from None
     for number in range(points):
         fields = out / "fields" / point_file(number)
         if not is_whole(fields):
-            raise Damaged(f"{fields}: is damaged: it is cut off, or missing")
+            raise damage(fields, CUT_OFF)
 
 
 class RunFiles:
@@ -295,7 +279,7 @@ class RunFiles:
         The reference length in metres, nan without units; on rank 0.
     """
 
-    journal: checkpoint.Checkpoint | None = None
+    journal: Checkpoint | None = None
 
     def __init__(
         self,
@@ -325,9 +309,7 @@ class RunFiles:
         """
         access_disk(self._comm, self._remove_end_of_run if continues else self._make_room)
         self.complete_points, self._rows = access_disk(self._comm, self._open)
-        self.journal = checkpoint.Checkpoint(
-            self._folder / checkpoint.NAME, self._scene.model.V, self._comm
-        )
+        self.journal = Checkpoint(self._folder / CHECKPOINT, self._scene.model.V, self._comm)
 
     def _make_room(self) -> None:
         """Replace an earlier run by an empty checkpoint; on rank 0.
@@ -335,7 +317,7 @@ class RunFiles:
         The order of the steps matters: whenever the process is killed, the files that are left are
         recognised as those of a run.
         """
-        folder, file = self._folder, self._folder / checkpoint.NAME
+        folder, file = self._folder, self._folder / CHECKPOINT
         new_checkpoint = folder / NEW_CHECKPOINT
         earlier_files = files_of_runs(folder) - {NEW_CHECKPOINT}
         write_whole(new_checkpoint, self._empty_checkpoint)  # a full disk stops here
@@ -349,8 +331,9 @@ class RunFiles:
         """Delete the files that the end of an interrupted run has written; on rank 0."""
         # the fields of points stay, and so do the checkpoint, path.csv and the chosen mesh
         files = files_of_runs(self._folder)
-        files = {name for name in files if not name.startswith("fields/")}
-        remove(self._folder, files - set(FILES_OF_PATH))
+        fields = {name for name in files if name.startswith("fields/")}
+        unfinished = {name for name in files if name.endswith(UNFINISHED)}
+        remove(self._folder, (files - fields - set(FILES_OF_PATH)) | unfinished)
         if self._mesh and not (self._folder / MESH).exists():
             write_whole(self._folder / MESH, self._mesh)
 
@@ -365,7 +348,7 @@ class RunFiles:
             Rows of path.csv that the interrupted run has written; empty for a new run.
         """
         # what summary.json takes from the checkpoint; it has the case and the version itself
-        identity = checkpoint.identity_in(self._folder / checkpoint.NAME) or {}
+        identity = run_identity.identity_in(self._folder / CHECKPOINT) or {}
         self._origin = {
             key: value for key, value in identity.items() if key not in ("case", "version")
         }
@@ -445,7 +428,7 @@ class RunFiles:
         def write() -> None:  # names the mesh file and the sources as they were at the start
             data = json.loads(json.dumps({**content, **self._origin}))
             data["says"] = terminal_text(verdict(data, read_lines(self._folder / "path.csv")))
-            write_whole(self._folder / SUMMARY, (json.dumps(data, indent=2) + "\n").encode())
+            write_object(self._folder / SUMMARY, data, indent=2)
 
         access_disk(self._comm, write)
 

@@ -30,10 +30,10 @@ from magshell_fenicsx.continuation.point import NoJournal, Point, RecordedValues
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.report.report import write_report
-from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_result
+from magshell_fenicsx.output.store.durable import errors_as_damage, read_result
 from magshell_fenicsx.output.store.folder import DiskError, access_disk, locked_folder, user_folder
 from magshell_fenicsx.output.store.manifest import MESH
+from magshell_fenicsx.output.store.run_identity import empty_checkpoint
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
@@ -343,10 +343,10 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
         Its `stopped` is the reason, if the run was interrupted or could not go on.
     """
     comm, say = output.comm, output.say
-    empty_checkpoint = b""
+    first_checkpoint = b""
     if folder:  # before the scene is built, which takes long: the files of the case may change
-        write = partial(checkpoint.empty_content, problem.document)
-        empty_checkpoint = access_disk(comm, write, "cannot be read")
+        write = partial(empty_checkpoint, problem.document)
+        first_checkpoint = access_disk(comm, write, "cannot be read")
     # the scene, and the files of the run
     result = _unloaded_result(problem, folder if resume else None, output)
     scene, mesh = result.scene, result.adapted
@@ -354,7 +354,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
     files = None
     if folder:
         mesh_content = mesh.to_json() if mesh else None
-        files = RunFiles(folder, scene, empty_checkpoint, resume=resume, mesh=mesh_content)
+        files = RunFiles(folder, scene, first_checkpoint, resume=resume, mesh=mesh_content)
     if files and files.complete_points:
         # times go on from the interrupted run
         output = replace(output, start=output.start - files.elapsed)
@@ -594,10 +594,8 @@ def _saved_mesh(problem: Problem, file: Path, comm: MPI.Comm) -> "Adapted | None
     )
     if not saved_content:
         return None
-    try:
+    with errors_as_damage(file):
         return Adapted.from_json(problem, saved_content)
-    except (ValueError, KeyError, TypeError, IndexError) as e:
-        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
 
 
 def _branch_error(result: Result) -> float | None:

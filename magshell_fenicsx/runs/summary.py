@@ -21,7 +21,7 @@ from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.output.fields.mode_fields import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
-from magshell_fenicsx.output.store.checkpoint import CASE_FILE
+from magshell_fenicsx.output.store.run_identity import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface

@@ -20,9 +20,9 @@ from mpi4py import MPI
 from pydantic import TypeAdapter
 
 from magshell_fenicsx.input.source import CaseError, read_source
-from magshell_fenicsx.output.store.checkpoint import CASE_FILE, NAME, identity_in
-from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
+from magshell_fenicsx.output.store.durable import Damaged, write_object
 from magshell_fenicsx.output.store.folder import access_disk, user_folder
+from magshell_fenicsx.output.store.run_identity import CASE_FILE, stored_identity
 from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import read_lines, write_csv
 from magshell_fenicsx.platform.environment import code_version
@@ -240,9 +240,7 @@ def _run_in_process(
 def _case_in(folder: Path) -> str:
     """Return the name of the case file whose run is in a folder; "" without a run."""
     with suppress(OSError, Damaged):
-        return str(
-            (identity_in(folder / NAME) or read_object(folder / "summary.json")).get(CASE_FILE, "")
-        )
+        return str(stored_identity(folder).get(CASE_FILE, ""))
     return ""
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from scipy.optimize import brentq
 
+from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.platform.environment import describe_machine
 from magshell_fenicsx.studies.measured import TIMES, Timings
 from magshell_fenicsx.studies.points import SweepPoint, short_key
@@ -323,13 +324,13 @@ def write_table(
         cells = [_cell(row, key) for key in (*keys, "ranks", *SHOWN_COLUMNS)]
         lines.append([f"**{cell}**" if row["pareto"] and cell else cell for cell in cells])
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    file.write_text(
+    text = (
         f"# {content['result']} of {content['case']}: error against run time\n\n"
         f"{content['reference_said']} {repeated(content['repeat'])} on "
         f"{describe_machine(content['machine'])}.\n"
-        f"{LEGEND}\n![](study.png)\n\n{table}\n",
-        encoding="utf-8",
+        f"{LEGEND}\n![](study.png)\n\n{table}\n"
     )
+    write_whole(file, text.encode())
 
 
 def repeated(repeat: int) -> str:

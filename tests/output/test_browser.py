@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from browser import PROGRAM, Page, browser
 from many import design
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from test_interactive import array, read
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.pictures.curve import INSET_MARGIN
-from magshell_fenicsx.output.pictures.lines import SEGMENTS_PER_INTERVAL, smooth, spline_curve
+from magshell_fenicsx.output.pictures.lines import cubics
 from magshell_fenicsx.output.report.interactive import plotly
 from magshell_fenicsx.output.report.report import write_report
 
@@ -174,31 +174,25 @@ def proportions_are_true(page: Page) -> None:
     assert np.ptp(drawn, axis=1).max() > 0.35 * sizes.max()
 
 
-def test_the_curve_is_that_of_the_picture(page: Page, report: Any) -> None:
-    """Between the points too: JavaScript's cubics against SciPy's, of a fold, a turn and a
-    vibration.
-    """
-    page.open(report("time"), 800)
+@pytest.mark.parametrize("kind", ["time", "magnet"])
+def test_the_curve_is_that_of_the_picture(kind: str, page: Page, report: Any) -> None:
+    """Between the points too: the page's cubics against those of curve.png, in every column."""
+    page.open(report(kind), 800)
     page.wait("document.body.dataset.ready === 'yes'")
-    x, y, t = [0.0, 0.5, 1.1, 0.8, 0.9], [0.0, 2.0, 2.5, 1.0, 1.5], [0.0, 0.5, 1.0, 2.0, 2.5]
-    located = [False, False, True, False, False]
-    texts = ", ".join(str(v).lower() for v in (x, y, located))
-    assert np.array(page.value(f"magshell.joined({texts}, null)")) == pytest.approx(
-        smooth(x, y, located), abs=1e-12
-    )
-    level = [(1, -1), (0, 0)]  # the load of a fold at the end, and a displacement at the beginning
-    found = np.array(
-        page.value(f"magshell.joined({texts}, null, {[list(each) for each in level]})")
-    )
-    assert found == pytest.approx(smooth(x, y, located, level), abs=1e-12)
-    found = np.array(page.value(f"magshell.joined({texts}, {t})"))
-    assert found == pytest.approx(spline_curve(x, y, t), abs=1e-12)
-    assert found[1] == pytest.approx(
-        CubicSpline(t, y)(
-            np.interp(np.arange(4 * SEGMENTS_PER_INTERVAL + 1) / SEGMENTS_PER_INTERVAL, range(5), t)
-        )
-    )
-    assert page.value("magshell.about.steps[0].lines[0].in_time") is True
+    about, data = read(report(kind).parent)
+    columns = about["columns"]
+    for s, step in enumerate(about["steps"]):
+        for n, line in enumerate(step["lines"]):
+            found = page.value(
+                "Object.keys(magshell.about.columns).map("
+                f"name => magshell.joined(magshell.about.steps[{s}].lines[{n}], name))"
+            )
+            values = [np.array(column["values"])[line["rows"]] for column in columns.values()]
+            slopes = array(data, line["slopes"]).reshape(len(columns), -1)
+            signs = np.array([column["sign"] for column in columns.values()])[:, None]
+            drawn = cubics(np.array(line["parameter"]), np.array(values), slopes)
+            assert np.array(found) == pytest.approx(signs * drawn, rel=1e-12, abs=1e-12)
+            assert set(step["axes"]) <= columns.keys()
 
 
 def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
@@ -269,39 +263,3 @@ def test_an_unstable_part_that_its_marks_hide_is_drawn_again(
         else:
             assert ranges == [None, None]
         assert page.errors == []
-
-
-def test_a_turn_between_points_is_smooth() -> None:
-    """A parabola through six points, its top between two: within 0.03, where a monotone curve is
-    cut off.
-    """
-    x = np.linspace(-1.0, 1.0, 6)
-    drawn = smooth(x.tolist(), (1 - x**2).tolist())
-    assert np.abs(drawn[1] - (1 - drawn[0] ** 2)).max() < 0.03
-    assert drawn[1].max() == pytest.approx(1.0, abs=0.02)
-    assert PchipInterpolator(x, 1 - x**2)(np.linspace(-1, 1, 99)).max() == pytest.approx(0.96)
-
-
-def test_a_curve_ends_level_at_a_fold() -> None:
-    """Five points of a sine up to its top, the last step the longest: within 0.008, 3 times better
-    than without.
-    """
-    x = np.array([0.0, 0.2, 0.4, 0.6, 1.0]) * np.pi / 2
-    drawn, guessed = (
-        smooth(x.tolist(), np.sin(x).tolist(), [], level) for level in ([(1, -1)], [])
-    )
-    wrong, without = (np.abs(curve[1] - np.sin(curve[0])).max() for curve in (drawn, guessed))
-    assert wrong < 0.008
-    assert without > 3 * wrong
-
-
-def test_a_vibration_keeps_its_form() -> None:
-    """Four points a period, where straight lines would lose three tenths: within a twentieth."""
-    t = np.arange(17) * 0.25 + 0.125
-    drawn = spline_curve(t.tolist(), np.sin(2 * np.pi * t).tolist(), t.tolist())
-    inner = drawn[:, 2 * SEGMENTS_PER_INTERVAL : -2 * SEGMENTS_PER_INTERVAL]
-    assert np.abs(inner[1] - np.sin(2 * np.pi * inner[0])).max() < 0.05
-    assert (
-        np.abs(np.interp(inner[0], t, np.sin(2 * np.pi * t)) - np.sin(2 * np.pi * inner[0])).max()
-        > 0.29
-    )

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from magshell_fenicsx.output.store import durable
+from magshell_fenicsx.output.store.table import write_csv
 
 
 def test_the_disk_is_waited_for_now_and_then(
@@ -46,3 +47,49 @@ def test_a_disk_that_fails_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         file.append(b"third")
     assert failure.value.filename == str(tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == b"first"
+
+
+def test_two_writers_of_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One begins and ends while the other writes: each file is whole, the last one stays."""
+    file, append, seen = tmp_path / "table.csv", durable.AppendedFile.append, list[bytes]()
+
+    def interleaved(stream: durable.AppendedFile, content: bytes, *, waits: bool = True) -> None:
+        append(stream, content[:3], waits=waits)
+        if not seen:
+            seen.append(b"")
+            durable.write_whole(file, b"of another job")
+            seen.append(file.read_bytes())
+        append(stream, content[3:], waits=waits)
+
+    monkeypatch.setattr(durable.AppendedFile, "append", interleaved)
+    durable.write_whole(file, b"of this job")
+    assert (seen[1], file.read_bytes()) == (b"of another job", b"of this job")
+    assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
+
+
+def test_a_table_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leaves the one before as it was."""
+    write_csv([{"a": 1}], ["a"], tmp_path / "table.csv")
+
+    def full(number: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as failure:
+        write_csv([{"a": 2}], ["a"], tmp_path / "table.csv")
+    assert failure.value.filename == str(tmp_path / "table.csv")
+    assert (tmp_path / "table.csv").read_text(encoding="utf-8") == "a\n1\n"
+    assert [each.name for each in tmp_path.iterdir()] == ["table.csv"]
+
+
+def test_errors_of_content_are_damage(tmp_path: Path) -> None:
+    """With the file's name and the kind of error, once; other errors are bugs."""
+    file = tmp_path / "a.json"
+    with (
+        pytest.raises(durable.Damaged, match=r"inner: is damaged: KeyError: 'rows'$"),
+        durable.errors_as_damage(file),
+        durable.errors_as_damage(tmp_path / "inner"),
+    ):
+        {}["rows"]
+    with pytest.raises(ZeroDivisionError), durable.errors_as_damage(file):
+        1 / 0  # noqa: B018

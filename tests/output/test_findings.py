@@ -8,8 +8,9 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.point import RecordedValues
-from magshell_fenicsx.output.store.checkpoint import Checkpoint, framed
+from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.journal_file import framed
 
 VECTOR = np.linspace(0, 1, 7) / 3
 

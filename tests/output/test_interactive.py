@@ -6,6 +6,7 @@ import base64
 import csv
 import json
 import re
+import shutil
 import webbrowser
 import zlib
 from pathlib import Path
@@ -21,10 +22,18 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.colours import couple
+from magshell_fenicsx.output.pictures.lines import (
+    cubics,
+    curve_coordinates,
+    curve_steps,
+    line_coordinates,
+    load_axis,
+)
 from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.report.interactive import chosen_frames, plotly, simplify
 from magshell_fenicsx.output.report.report import open_in_browser, report_of, write_report
-from magshell_fenicsx.output.store.checkpoint import identity, refuse_other_case
+from magshell_fenicsx.output.store.run_identity import identity, refuse_other_case
+from magshell_fenicsx.output.store.table import read_rows, write_csv
 
 needs_plotly = pytest.mark.skipif(plotly() is None, reason="Plotly is not installed")
 
@@ -87,6 +96,42 @@ def test_numbers_are_those_of_the_path(folder: Path) -> None:
     assert sorted({*before["rows"], *pressed["rows"]}) == list(range(len(rows)))
     assert about["frames"][0] == 0
     assert about["frames"][-1] == len(rows) - 1
+
+
+@needs_plotly
+def test_curves_are_those_of_the_picture(folder: Path) -> None:
+    """Between the points too, where the page has parameter and slopes of every column."""
+    about, data = read(folder)
+    rows, names = read_rows(folder / "path.csv"), list(about["columns"])
+    step = about["steps"][-1]
+    lines = line_coordinates(curve_steps(rows, "pressure")[-1])
+    assert [line["pieces"] for line in step["lines"]] == [
+        [list(piece) for piece in line.segments] for line in lines
+    ]
+    for found, line in zip(step["lines"], lines, strict=True):
+        places = [curve_coordinates(row, "pressure") for row in line.rows]
+        columns = [about["columns"][name] for name in step["axes"]]
+        values = [c["sign"] * np.array(c["values"])[found["rows"]] for c in columns]
+        of_columns = array(data, found["slopes"]).reshape(len(names), -1)
+        slopes = [about["columns"][n]["sign"] * of_columns[names.index(n)] for n in step["axes"]]
+        drawn = line.smooth_curve(*zip(*places, strict=True), load_axis=load_axis("pressure"))
+        joined = cubics(np.array(found["parameter"]), np.array(values), np.array(slopes))
+        assert (np.abs(joined - drawn) <= 1e-6 * np.ptp(drawn, axis=1)[:, None]).all()
+
+
+@needs_plotly
+def test_a_column_without_numbers(folder: Path, tmp_path: Path) -> None:
+    """A solid's energy has no parts: nan, which JSON does not know and a browser refuses."""
+    shutil.copytree(folder, tmp_path / "solid")
+    file = tmp_path / "solid/path.csv"
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    write_csv([row | {"stretching": "nan", "bending": "nan"} for row in rows], list(rows[0]), file)
+    write_report(tmp_path / "solid")
+    text = parts(tmp_path / "solid")["about"]
+    assert "NaN" not in text
+    assert {"stretching", "bending"}.isdisjoint(json.loads(text)["columns"])
+    assert "stretching" in json.loads(parts(folder)["about"])["columns"]
 
 
 @needs_plotly

@@ -11,7 +11,7 @@ from command import magshell, read_path
 from conftest import CASES, draw_nothing
 from interrupted import check_same_path
 
-from magshell_fenicsx.output.store.checkpoint import framed
+from magshell_fenicsx.output.store.journal_file import framed
 from magshell_fenicsx.runs.running import Watch
 
 CASE = (CASES / "dimple_buckling.yaml", "--set=mesh={refinement: 0.3, degree: 2}")
@@ -157,7 +157,11 @@ def test_a_field_that_is_cut_off_is_written_again(
 ) -> None:
     out = tmp_path / "out"
     file = damaged(interrupted, out, "fields/point_0002.vtu", cut)
+    left = [out / f"fields/point_0003.vtu{ending}" for ending in (".0a1b2c3d.unfinished", ".mine")]
+    for each in left:  # of a kill, and of somebody else
+        each.write_bytes(b"<VTK")
     assert magshell("run", *CASE, "--out", out, "--resume").returncode == 0
+    assert [each.exists() for each in left] == [False, True]
     check_same_path(out, complete)
     assert file.read_bytes() == (complete / "fields/point_0002.vtu").read_bytes()
 

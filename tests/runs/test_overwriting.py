@@ -8,7 +8,7 @@ from command import magshell
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.run_identity import empty_checkpoint
 
 FILE = CASES / "dimple_buckling.yaml"
 SMALL = ("--set", "mesh.refinement=0.3", "--set", "mesh.degree=2", "--no-pictures")
@@ -57,9 +57,7 @@ def test_the_same_case_in_another_file(out: Path, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_run_of_another_file_is_kept_too(tmp_path: Path) -> None:
-    (tmp_path / "checkpoint").write_bytes(
-        checkpoint.empty_content(ms.Case.load(FILE).problem().document)
-    )
+    (tmp_path / "checkpoint").write_bytes(empty_checkpoint(ms.Case.load(FILE).problem().document))
     with pytest.raises(ms.CaseError, match=r"has a run of dimple_buckling\.yaml"):
         ms.run(other(tmp_path, "symmetry: half\n"), tmp_path)
     assert (tmp_path / "checkpoint").exists()

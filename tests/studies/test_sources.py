@@ -20,7 +20,7 @@ import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store import run_identity
 from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.output.store.stored_results import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
@@ -119,7 +119,7 @@ def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any, no_picture
     with pytest.raises(AlreadyComplete):
         run(case, tmp_path, resume=True)
     edited()
-    with pytest.raises(checkpoint.OtherSources, match=OTHER.replace("+", r"\+")):
+    with pytest.raises(run_identity.OtherSources, match=OTHER.replace("+", r"\+")):
         run(case, tmp_path, resume=True)
     assert (tmp_path / "summary.json").exists()
     summary, _ = obstacles.finished(case, tmp_path)
@@ -131,16 +131,16 @@ def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
     others.
     """
     this, file = document_of(Case.load(BUCKLING)), tmp_path / "checkpoint"
-    file.write_bytes(checkpoint.empty_content(this))
-    checkpoint.check_resumable(file, this)
-    known = checkpoint.identity(this)
+    file.write_bytes(run_identity.empty_checkpoint(this))
+    run_identity.check_resumable(file, this)
+    known = run_identity.identity(this)
     edited()
     with pytest.raises(CaseError, match=r"another run: mesh.degree is 4 there and 3 here"):
-        checkpoint.check_resumable(file, document_of(Case.load(BUCKLING, ["mesh.degree=3"])))
-    with pytest.raises(checkpoint.OtherSources):
-        checkpoint.check_resumable(file, this)
-    with pytest.raises(checkpoint.OtherSources, match=r"\(0\.1\.0; these are"):
-        checkpoint.refuse_other_case({"version": "0.1.0", "case": known["case"]}, this, tmp_path)
+        run_identity.check_resumable(file, document_of(Case.load(BUCKLING, ["mesh.degree=3"])))
+    with pytest.raises(run_identity.OtherSources):
+        run_identity.check_resumable(file, this)
+    with pytest.raises(run_identity.OtherSources, match=r"\(0\.1\.0; these are"):
+        run_identity.refuse_other_case({"version": "0.1.0", "case": known["case"]}, this, tmp_path)
 
 
 def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None) -> None:
@@ -149,7 +149,7 @@ def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None
     assert run(case, tmp_path, time_limit=0).stopped
     (tmp_path / MESH).write_bytes(b"of these sources")
     edited()
-    with pytest.raises(checkpoint.OtherSources):
+    with pytest.raises(run_identity.OtherSources):
         run(case, tmp_path, resume=True)
     assert run(case, tmp_path, overwrite=True).stopped is None
     assert (tmp_path / MESH).read_bytes() != b"of these sources"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.durable import errors_as_damage, read_result
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.moving_source import combined_motion
 from magshell_fenicsx.shape.drawn_bodies import Solid
@@ -186,10 +186,9 @@ def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[S
     file = file if file.exists() else folder / FILE_OF_ALL_POINTS
     if not file.exists():
         return (), ()
-    try:
-        return _read(file.read_text(encoding="utf-8"))
-    except (KeyError, ValueError, IndexError) as e:
-        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+    content = read_result(file)
+    with errors_as_damage(file):
+        return _read(content.decode())
 
 
 def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:

@@ -28,7 +28,7 @@ from magshell_fenicsx.output.fields.surface import (
     Surface,
     completed,
 )
-from magshell_fenicsx.output.store.durable import Damaged, write_whole
+from magshell_fenicsx.output.store.durable import damage, errors_as_damage, write_whole
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
@@ -163,15 +163,14 @@ def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "
     Raises
     ------
     Damaged
-        If the file is damaged. A KeyError, ValueError, IndexError, TypeError or AttributeError of
-        `convert` counts as damage.
+        If the file is damaged. One of `ERRORS_OF_CONTENT` from `convert` counts as damage.
     """
     from vtkmodules.vtkCommonCore import vtkObject
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
     if not is_whole(file):
         reason = "it is cut off" if file.exists() else "it is missing"
-        raise Damaged(f"{file}: is damaged: {reason}")
+        raise damage(file, reason)
     # VTK reports errors to an observer and goes on; its own messages are switched off meanwhile
     errors, reader = list[str](), vtkXMLUnstructuredGridReader()
     vtk_warnings = vtkObject.GetGlobalWarningDisplay()
@@ -179,14 +178,13 @@ def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "
     reader.SetFileName(str(file))
     vtkObject.GlobalWarningDisplayOff()
     try:
-        reader.Update()
-        content = convert(reader.GetOutput())
-    except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
-        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+        with errors_as_damage(file):
+            reader.Update()
+            content = convert(reader.GetOutput())
     finally:
         vtkObject.SetGlobalWarningDisplay(vtk_warnings)
     if errors or reader.GetErrorCode():
-        raise Damaged(f"{file}: is damaged: VTK cannot read it")
+        raise damage(file, "VTK cannot read it")
     return content
 
 

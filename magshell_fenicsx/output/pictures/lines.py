@@ -11,6 +11,7 @@ time.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -214,6 +215,38 @@ class Line:
             if row["label"] == "fold" and row["amplitude"] == self.amplitude
         ]
 
+    def parameter(self, x: Sequence[float], y: Sequence[float]) -> Array:
+        """Return the parameter (n,) of the smooth curve at the line's n rows, which ascends.
+
+        It is the time of a motion, and else the root of the chord in the axes x and y.
+
+        Parameters
+        ----------
+        x, y
+            (n,) coordinates of the rows.
+        """
+        return self._spline_times if self._has_spline else chord_parameter(x, y)
+
+    def slopes(
+        self, parameter: Array, values: Sequence[float], *, of_amplitude: bool = False
+    ) -> Array:
+        """Return the derivatives (n,) of a coordinate by the parameter, at the line's n rows.
+
+        Parameters
+        ----------
+        parameter
+            (n,) that of `parameter`.
+        values
+            (n,) the coordinate at the rows.
+        of_amplitude
+            Whether the coordinate is the amplitude, which has its extreme at a fold.
+        """
+        if self._has_spline:
+            return spline_slopes(parameter, values)
+        slopes = limited_slopes(parameter, values, [row["label"] in LOCATED for row in self.rows])
+        slopes[self.level if of_amplitude else []] = 0.0
+        return slopes
+
     def smooth_curve(
         self, x: Sequence[float], y: Sequence[float], *, load_axis: int | None = None
     ) -> Array:
@@ -226,12 +259,27 @@ class Line:
         load_axis
             Which of the coordinates is the amplitude, 0 or 1; None if none is.
         """
-        if self.in_time:
-            return spline_curve(x, y, [float(row["time"]) for row in self.rows])
-        # at an end that is a fold the amplitude has its extreme
-        level = [] if load_axis is None else [(load_axis, end) for end in self.level]
-        located = [row["label"] in LOCATED for row in self.rows]
-        return smooth(x, y, located=located, level=level)
+        parameter = self.parameter(x, y)
+        slopes = [
+            self.slopes(parameter, values, of_amplitude=axis == load_axis)
+            for axis, values in enumerate((x, y))
+        ]
+        return cubics(parameter, np.array([x, y], float), np.array(slopes))
+
+    @cached_property
+    def _spline_times(self) -> Array:
+        """Times (n,) of the rows of a motion; empty otherwise."""
+        return np.array([float(row["time"]) for row in self.rows] if self.in_time else [])
+
+    @property
+    def _has_spline(self) -> bool:
+        """Whether a spline over the time can join the rows.
+
+        It needs four points. Only the first two may have one time: those of the point before a
+        motion and of its first point.
+        """
+        is_later = np.diff(self._spline_times) > 0
+        return bool(is_later.sum() >= 3 and is_later[1:].all())
 
 
 def line_coordinates(step: CurveStep) -> list[Line]:
@@ -273,58 +321,62 @@ def load_axis(amplitude: str) -> int:
     return 0 if registered(amplitude).sideways else 1
 
 
-def smooth(
-    x: Sequence[float],
-    y: Sequence[float],
-    located: Sequence[bool] = (),
-    level: Sequence[tuple[int, int]] = (),
-) -> Array:
+def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ()) -> Array:
     """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through n points.
 
-    The parameter is the root of the scaled chord. The curve consists of cubics. Their slopes at the
-    points are those of parabolas through three points, limited so that the curve rises wherever the
-    points rise (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). A coordinate that turns
-    between two points turns smoothly there. One that turns at a located point turns exactly at it.
+    Its parameter is that of `chord_parameter`, its slopes those of `limited_slopes`.
 
     Parameters
     ----------
     x, y
         (n,) coordinates of the points.
     located
-        Whether each point is a fold or a bifurcation, where a coordinate that turns has its
-        extreme.
-    level
-        Pairs (coordinate, end): the coordinate, 0 or 1, has its extreme at the end, 0 or -1.
+        Whether each point is a fold or a bifurcation; empty if none is.
+    """
+    parameter = chord_parameter(x, y)
+    slopes = [limited_slopes(parameter, values, located) for values in (x, y)]
+    return cubics(parameter, np.array([x, y], float), np.array(slopes))
+
+
+def chord_parameter(x: Sequence[float], y: Sequence[float]) -> Array:
+    """Return the parameter (n,) of a smooth curve through n points: the root of the chord.
+
+    It grows between two points by the root of their distance in a picture, in which both axes count
+    equally.
+
+    Parameters
+    ----------
+    x, y
+        (n,) coordinates of the points.
     """
     xy = np.array([x, y], float)
-    scale = np.ptp(xy, axis=1)  # sizes of a picture, in which both axes count equally
-    if xy.shape[1] == 1:
-        return xy
-    # the parameter at the points, and the slopes there: derivatives by the parameter
+    scale = np.ptp(xy, axis=1)
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
-    chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, MIN_CHORD)))])
-    is_located = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
-    slopes = np.array([_slopes(chord, values, is_located) for values in xy])
-    for coordinate, end in level:
-        slopes[coordinate, end] = 0.0
-    # in each interval, with t from 0 to 1: value + first t + quadratic t² + cubic t³ (Horner)
-    t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
-    h, rise = np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
-    first_term, last_term = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
-    quadratic, cubic = 3 * rise - 2 * first_term - last_term, first_term + last_term - 2 * rise
-    curve = xy[:, :-1, None] + t * (first_term + t * (quadratic + t * cubic))
-    return np.concatenate([curve.reshape(2, -1), xy[:, -1:]], axis=1)
+    return np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, MIN_CHORD)))])
 
 
-def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
-    """Return the derivatives (n,) of values at n points by a parameter t, for a smooth curve.
+def limited_slopes(
+    parameter: Array, values: Sequence[float], located: Sequence[bool] = ()
+) -> Array:
+    """Return the derivatives (n,) of values at n points by a parameter, for a smooth curve.
 
-    They are those of parabolas through three points, limited so that the values rise wherever those
-    at the points rise. `located` tells which points are folds or bifurcations.
+    They are those of parabolas through three points, limited so that the curve rises wherever the
+    points rise (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). A coordinate that turns
+    between two points turns smoothly there. One that turns at a located point turns exactly at it.
+
+    Parameters
+    ----------
+    parameter
+        (n,) the parameter at the points, which ascends.
+    values
+        (n,) a coordinate of the points.
+    located
+        Whether each point is a fold or a bifurcation; empty if none is.
     """
-    h, chords = np.diff(t), np.diff(values) / np.diff(t)  # intervals, and slopes of the chords
-    if len(chords) == 1:
-        return np.full(2, chords[0])
+    h = np.diff(parameter)  # intervals
+    chords = np.diff(np.array(values, float)) / h  # slopes of the chords
+    if len(chords) < 2:
+        return np.full(len(parameter), chords.sum())
     # at each inner point: the chords and the intervals before and after it
     chords_before, chords_after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
     # the largest slope in each interval, and so at each inner point. There is no limit in an
@@ -337,7 +389,8 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
         (h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes
     )
     # the coordinate turns exactly at a fold or bifurcation
-    inner_slopes[located[1:-1] & (chords_before * chords_after < 0)] = 0.0
+    is_located = np.array(located, bool) if len(located) else np.zeros(len(parameter), bool)
+    inner_slopes[is_located[1:-1] & (chords_before * chords_after < 0)] = 0.0
     ends = [
         _end_slope(h[0], h[1], chords[0], chords[1]),
         _end_slope(h[-1], h[-2], chords[-1], chords[-2]),
@@ -364,37 +417,42 @@ def _end_slope(h1: float, h2: float, first: float, second: float) -> float:
     return float(np.clip(slope, -MAX_SLOPE_RATIO * abs(first), MAX_SLOPE_RATIO * abs(first)))
 
 
-def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[float]) -> Array:
-    """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through n points of a motion.
+def spline_slopes(times: Array, values: Sequence[float]) -> Array:
+    """Return the derivatives (n,) by the time of a cubic spline through n points of a motion.
 
-    It is a cubic spline over the time. With four points a period, a vibration keeps its form. The
-    point before a motion and its first point have the same time and are joined by a straight line.
-    `smooth` takes the place of the spline where points are too few, or where further times are
-    equal.
+    With four points a period, a vibration keeps its form. The point before a motion and its first
+    point may have the same time. The spline begins at the second of them then, and the slope at the
+    first is zero.
 
     Parameters
     ----------
-    x, y
-        (n,) coordinates of the points.
-    point_times
-        (n,) their times.
+    times
+        (n,) times of the points.
+    values
+        (n,) a coordinate of the points.
     """
-    xy, times = np.array([x, y], float), np.array(point_times, float)
-    is_later = np.concatenate([[True], np.diff(times) > 0])  # than the point before
-    # a spline needs four points; only the first two may have one time
-    if is_later.sum() < 4 or not is_later[2:].all():
-        return smooth(x, y)
-    refined_times = _refined(times)
-    spline = scipy.interpolate.CubicSpline(times[is_later], xy[:, is_later], axis=1)
-    curve = np.asarray(spline(refined_times))
-    if not is_later[1]:  # the point before the motion and its first point
-        count = SEGMENTS_PER_INTERVAL + 1
-        curve[:, :count] = np.linspace(xy[:, 0], xy[:, 1], count).T
-    return curve
+    begin = 0 if times[1] > times[0] else 1
+    spline = scipy.interpolate.CubicSpline(times[begin:], values[begin:])
+    return np.concatenate([np.zeros(begin), spline(times[begin:], 1)])
 
 
-def _refined(values: Array) -> Array:
-    """Return values (n,) with SEGMENTS_PER_INTERVAL equal steps between every two of them."""
-    count = SEGMENTS_PER_INTERVAL * (len(values) - 1) + 1
-    positions = np.arange(count) / SEGMENTS_PER_INTERVAL
-    return np.interp(positions, np.arange(len(values)), values)
+def cubics(parameter: Array, values: Array, slopes: Array) -> Array:
+    """Return points (k, SEGMENTS_PER_INTERVAL (n - 1) + 1) of cubics between n points.
+
+    An interval of length zero becomes a straight line. The page of a report does the same with
+    parameter, values and slopes (`cubics` in output/report/interactive.js).
+
+    Parameters
+    ----------
+    parameter
+        (n,) the parameter at the points.
+    values, slopes
+        (k, n) coordinates of the points, and their derivatives by the parameter there.
+    """
+    # in each interval, with t from 0 to 1: value + first t + quadratic t² + cubic t³ (Horner)
+    t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
+    h, rise = np.diff(parameter)[:, None], np.diff(values, axis=1)[..., None]
+    first_term, last_term = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
+    quadratic, cubic = 3 * rise - 2 * first_term - last_term, first_term + last_term - 2 * rise
+    curve = values[:, :-1, None] + t * (first_term + t * (quadratic + t * cubic))
+    return np.concatenate([curve.reshape(len(values), -1), values[:, -1:]], axis=1)

@@ -14,7 +14,7 @@
     throw e;
   }
   const data = await unpacked("shells");
-  const kinds = {uint8: Uint8Array, uint16: Uint16Array, int16: Int16Array, uint32: Uint32Array};
+  const kinds = {uint8: Uint8Array, uint16: Uint16Array, int16: Int16Array, uint32: Uint32Array, float32: Float32Array};
   const array = it => new kinds[it.kind](data, it.at, it.size);
   const scaled = it => Float32Array.from(array(it), v => it.low + it.step * v);
   const r0 = scaled(about.r0), triangles = array(about.triangles), count = r0.length / 3;
@@ -109,60 +109,27 @@
   const drawShell = () => { const box = bounds(); return Plotly.react("shell3d", [shell(), ...solids(), lines(), triad(box)],
     {scene: scene(box), margin: {l: 0, r: 0, t: 0, b: 0}, uirevision: "kept", showlegend: false}, plain); };
 
-  // The same curves as in curve.png (output/pictures/lines.py): cubics with limited slopes, over the time splines.
-  const fine = 16, steepest = 3;
-  const hermite = (t, v, slopes) => {
+  // The same curves as in curve.png: cubics between points, from the parameter and the slopes there (output/pictures/lines.py).
+  const fine = about.segments;
+  const cubics = (t, v, slopes) => {
     const out = [];
     for (let i = 0; i + 1 < t.length; i++) {
-      const h = t[i + 1] - t[i];
+      const h = t[i + 1] - t[i], rise = v[i + 1] - v[i], first = h * slopes[i], second = h * slopes[i + 1];
       for (let k = 0; k < fine; k++) {
-        const s = k / fine, r = 1 - s;
-        out.push((1 + 2 * s) * r * r * v[i] + s * r * r * h * slopes[i] + s * s * (3 - 2 * s) * v[i + 1] - s * s * r * h * slopes[i + 1]);
+        const s = k / fine;
+        out.push(v[i] + s * (first + s * (3 * rise - 2 * first - second + s * (first + second - 2 * rise))));
       }
     }
     out.push(last(v));
     return out;
   };
-  const limited = (slope, a) => Math.max(-steepest * a, Math.min(steepest * a, slope));
-  const end = (h1, h2, a, b) => { const s = ((2 * h1 + h2) * a - h1 * b) / (h1 + h2); return s * a <= 0 ? 0 : limited(s, Math.abs(a)); };
-  const slopesOf = (t, v, located) => {
-    const h = t.slice(1).map((x, i) => x - t[i]), d = h.map((x, i) => (v[i + 1] - v[i]) / x), m = h.length;
-    if (m === 1) return [d[0], d[0]];
-    const most = i => d[i - 1] * d[i + 1] < 0 ? Infinity : Math.abs(d[i]); // it turns between these two points
-    const out = [end(h[0], h[1], d[0], d[1])];
-    for (let i = 1; i < m; i++) out.push(located[i] && d[i - 1] * d[i] < 0 ? 0
-      : limited((h[i] * d[i - 1] + h[i - 1] * d[i]) / (h[i - 1] + h[i]), Math.min(most(i - 1), most(i))));
-    return [...out, end(h[m - 1], h[m - 2], d[m - 1], d[m - 2])];
-  };
-  const splineSlopes = (t, v) => { // not-a-knot: two unknowns in the first and the last row, three in the others
-    const n = t.length, h = t.slice(1).map((x, i) => x - t[i]), d = h.map((x, i) => (v[i + 1] - v[i]) / x);
-    const low = new Float64Array(n), middle = new Float64Array(n), up = new Float64Array(n), right = new Float64Array(n);
-    const edge = (i, h1, h2, d1, d2) => { middle[i] = h2; right[i] = ((h1 + 2 * (h1 + h2)) * h2 * d1 + h1 * h1 * d2) / (h1 + h2); return h1 + h2; };
-    up[0] = edge(0, h[0], h[1], d[0], d[1]);
-    for (let i = 1; i < n - 1; i++) { low[i] = h[i]; middle[i] = 2 * (h[i - 1] + h[i]); up[i] = h[i - 1]; right[i] = 3 * (h[i] * d[i - 1] + h[i - 1] * d[i]); }
-    low[n - 1] = edge(n - 1, h[n - 2], h[n - 3], d[n - 2], d[n - 3]);
-    for (let i = 1; i < n; i++) { const f = low[i] / middle[i - 1]; middle[i] -= f * up[i - 1]; right[i] -= f * right[i - 1]; }
-    const out = new Array(n);
-    for (let i = n - 1; i >= 0; i--) out[i] = (right[i] - (i + 1 < n ? up[i] * out[i + 1] : 0)) / middle[i];
-    return out;
-  };
-  const joined = (x, y, located, times, level = []) => { // level: which coordinate has its extreme at which end, 0 or -1
-    const later = times && times.map((t, i) => i === 0 || t > times[i - 1]);
-    if (later && later.filter(Boolean).length >= 4 && later.slice(2).every(Boolean)) {
-      const skip = later[1] ? 0 : 1, rest = v => v.slice(skip), t = rest(times);
-      const curve = [x, y].map(v => hermite(t, rest(v), splineSlopes(t, rest(v))));
-      if (skip) curve.forEach((c, k) => { const v = [x, y][k]; for (let i = fine - 1; i >= 0; i--) c.unshift(v[0] + i / fine * (v[1] - v[0])); });
-      return curve;
-    }
-    if (x.length < 2) return [x, y];
-    const span = v => Math.max(...v) - Math.min(...v) || 1, chord = [0];
-    for (let i = 1; i < x.length; i++) chord.push(last(chord) + Math.sqrt(Math.max(Math.hypot((x[i] - x[i - 1]) / span(x), (y[i] - y[i - 1]) / span(y)), 1e-12)));
-    const slopes = [x, y].map(v => slopesOf(chord, v, located));
-    for (const [c, end] of level) slopes[c][end < 0 ? x.length - 1 : 0] = 0;
-    return [x, y].map((v, c) => hermite(chord, v, slopes[c]));
-  };
 
-  const on = name => about.columns[name].values.map(v => about.columns[name].sign * v);
+  const signed = (name, values) => values.map(v => about.columns[name].sign * v);
+  const on = name => signed(name, about.columns[name].values);
+  const joined = (line, name) => {
+    const v = on(name), n = line.rows.length, first = n * Object.keys(about.columns).indexOf(name);
+    return cubics(line.parameter, line.rows.map(i => v[i]), signed(name, array(line.slopes).subarray(first, first + n)));
+  };
   const palette = ["#1f77b4", "#ff7f0e", "#9467bd", "#8c564b", "#17becf", "#7f7f7f", "#bcbd22", "#e377c2"];
   const isLocated = i => about.labels[i] === "fold" || about.labels[i] === "bifurcation";
   // As in curve.png (output/pictures/curve.py): an unstable part that its marks hide is drawn once more in an inset.
@@ -200,9 +167,7 @@
     shown.forEach((s, n) => {
       const color = palette[n % palette.length];
       for (const l of s.lines) {
-        const pick = v => l.rows.map(i => v[i]), is = l.rows;
-        const load = [part("across").value, part("up").value].indexOf(s.load), level = load < 0 ? [] : l.level.map(end => [load, end]);
-        const curve = joined(pick(x), pick(y), is.map(isLocated), l.in_time ? pick(about.times) : null, level);
+        const is = l.rows, curve = ["across", "up"].map(axis => joined(l, part(axis).value));
         curves.push(curve);
         for (const [first, end, unstable] of l.pieces) {
           const cut = v => v.slice(first * fine, end * fine + 1), name = (step < 0 ? s.title + ", " : "") + (unstable ? "unstable" : "stable");

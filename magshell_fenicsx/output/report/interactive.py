@@ -24,6 +24,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +37,11 @@ from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellate
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
 from magshell_fenicsx.output.pictures.lines import (
+    SEGMENTS_PER_INTERVAL,
     CurveStep,
+    Line,
     axes_for,
+    curve_coordinates,
     curve_steps,
     is_unstable,
     line_coordinates,
@@ -220,7 +224,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {
-        **_path(rows, last_row, pole_of(case)),
+        **_path(rows, last_row, pole_of(case), arrays),
         # numbers of the rows that are frames, and the frame with which the page opens
         "frames": [rows.index(row) for row in frames],
         "opens": frames.index(headline_row) if headline_row in frames else len(frames) - 1,
@@ -313,11 +317,12 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
 
 
 def _varies(column: str, rows: Sequence[Row]) -> bool:
-    """Return whether a column has several values in some rows."""
-    return len({row[column] for row in rows}) > 1
+    """Return whether a column has several values in some rows; not if it has nan, as of a solid."""
+    values = {float(row[column]) for row in rows}
+    return len(values) > 1 and not any(map(isnan, values))
 
 
-def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
+def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[str, Any]:
     """Return the path for the page: varying columns of path.csv, labels and curves.
 
     Parameters
@@ -329,6 +334,8 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         curve.
     pole
         Words for the point of w_pole_over_h.
+    arrays
+        Gets the slopes of the curves.
     """
     amplitude_name = next(
         (str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), ""
@@ -354,11 +361,11 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         }
     return {
         "columns": columns,
-        "steps": [_step(step, rows) for step in steps],
+        "steps": [_step(step, rows, columns, arrays) for step in steps],
+        "segments": SEGMENTS_PER_INTERVAL,
         "points": [row["point"] for row in rows],
         "labels": [row["label"] for row in rows],
         "unstable": [is_unstable(row) for row in rows],
-        "times": [row["time"] for row in rows] if "time" in rows[0] else [],
     }
 
 
@@ -377,10 +384,13 @@ def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
     return by_column
 
 
-def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
+def _step(
+    part: CurveStep, rows: Sequence[Row], columns: Iterable[str], arrays: "_Packed"
+) -> dict[str, Any]:
     """Return a step of the curve for the page.
 
-    It has title, axes, numbers of its rows in `rows`, and the lines between these.
+    It has title, axes, numbers of its rows in `rows`, and the lines between these. The slopes of
+    all `columns` along the lines are put into `arrays`.
     """
     number_of_point = {int(row["point"]): i for i, row in enumerate(rows)}
 
@@ -388,15 +398,12 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the numbers in `rows` of the rows of a line."""
         return [number_of_point[int(row["point"])] for row in rows_of_line]
 
-    # the page draws a line as the pictures do: stable and unstable pieces of smooth curves. `level`
-    # are the ends (0 or -1) at which the amplitude has an extreme
     varied_quantity = quantity(amplitude(part.amplitude).column)
     lines = [
         {
             "rows": numbers_of(line.rows),
             "pieces": line.segments,
-            "in_time": line.in_time,
-            "level": line.level,
+            **_cubics(line, part, columns, arrays),
         }
         for line in line_coordinates(part)
     ]
@@ -404,11 +411,28 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
         "title": part.title or varied_quantity.words,
         "axes": [q.name for q in axes_for(part)],
         "varied": varied_quantity.name,
-        # the column of the axis that shows the amplitude
-        "load": axes_for(part)[load_axis(part.amplitude)].name,
         "rows": numbers_of(part.rows),
         "lines": lines,
     }
+
+
+def _cubics(
+    line: Line, part: CurveStep, columns: Iterable[str], arrays: "_Packed"
+) -> dict[str, Any]:
+    """Return the parameter of a line at its n rows, and where the slopes there are in `arrays`.
+
+    Slopes are (columns, n). The page draws the line with them as the pictures do. The parameter is
+    that of the axes of the step, whichever columns the page shows.
+    """
+    places = [curve_coordinates(row, part.amplitude) for row in line.rows]
+    parameter = line.parameter(*zip(*places, strict=True))
+    # the column of the axis that shows the amplitude
+    load_column = axes_for(part)[load_axis(part.amplitude)].name
+    slopes = []
+    for name in columns:
+        values = [float(row[name]) for row in line.rows]
+        slopes.append(line.slopes(parameter, values, of_amplitude=name == load_column))
+    return {"parameter": parameter.tolist(), "slopes": arrays.raw(np.array(slopes, np.float32))}
 
 
 def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]:

@@ -21,7 +21,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.durable import damage
 from magshell_fenicsx.output.store.stored_results import is_flat, pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
@@ -480,9 +480,9 @@ def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
     """
     summary, lines = read_summary(folder), read_lines(folder / "path.csv")
     if len(lines) != summary["points"]:
-        raise Damaged(
-            f"{folder / 'path.csv'}: is damaged: it has {len(lines)} points, "
-            f"and summary.json says {summary['points']}"
+        raise damage(
+            folder / "path.csv",
+            f"it has {len(lines)} points, and summary.json says {summary['points']}",
         )
     return summary, lines
 

@@ -2,28 +2,58 @@
 
 Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`). A sync waits until the
 disk has what the system keeps in memory; without it a power failure may lose what was written, a
-kill may not. Reading refuses anything that is no regular file.
+kill may not. Reading refuses anything that is no regular file. What cannot be used is `Damaged`,
+with one form of message (`damage`).
 """
 
+import csv
 import json
 import math
 import os
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from errno import EFBIG, EINVAL, EISDIR
 from pathlib import Path
 from typing import Any, BinaryIO
+from uuid import uuid4
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.input_files import open_regular, read_bounded
 
 # s between two waits for the disk: on a busy one each takes as long as a point of a small model
 SYNC_INTERVAL = 1.0
+UNFINISHED = ".unfinished"  # ending of a file that is being written, or that a kill has left
+# errors of code that gets another content than the program wrote
+ERRORS_OF_CONTENT = (ValueError, KeyError, TypeError, IndexError, AttributeError, csv.Error)
 
 
 class Damaged(CaseError):
     """Error: a file of results is not what the program wrote; the message names it and says why."""
+
+
+def damage(file: Path, reason: str, *, may_be_earlier: bool = False) -> Damaged:
+    """Return the error that a file of results is damaged, for a reason.
+
+    Parameters
+    ----------
+    may_be_earlier
+        Whether an earlier version may have written such a file.
+    """
+    if may_be_earlier:
+        return Damaged(f"{file}: is damaged, or of an earlier version: {reason}")
+    return Damaged(f"{file}: is damaged: {reason}")
+
+
+@contextmanager
+def errors_as_damage(file: Path) -> Iterator[None]:
+    """Turn errors within `with`, of code that interprets the content of a file, into `Damaged`."""
+    try:
+        yield
+    except Damaged:
+        raise
+    except ERRORS_OF_CONTENT as e:
+        raise damage(file, f"{type(e).__name__}: {e}") from None
 
 
 def read_result(file: Path) -> bytes:
@@ -65,7 +95,7 @@ def _error_for(e: OSError) -> Exception:
     error itself.
     """
     if e.errno in (EFBIG, EINVAL, EISDIR):
-        return Damaged(f"{e.filename}: is damaged: {e.strerror}")
+        return damage(e.filename, str(e.strerror))
     return e
 
 
@@ -82,9 +112,9 @@ def read_object(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_result(file))
     except (ValueError, RecursionError) as e:
-        raise Damaged(f"{file}: is damaged: no JSON: {e}") from None
+        raise damage(file, f"no JSON: {e}") from None
     if not isinstance(content, dict):
-        raise Damaged(f"{file}: is damaged: no JSON object")
+        raise damage(file, "no JSON object")
     return content
 
 
@@ -102,6 +132,8 @@ def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> Non
 def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
     """Write a file so that at every moment the complete old or the complete new one exists.
 
+    Several processes may write the same file; the last one counts.
+
     Parameters
     ----------
     waits
@@ -113,9 +145,8 @@ def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
     OSError
         With the file's name; the old file is unchanged.
     """
-    unfinished = file.with_name(file.name + ".unfinished")
+    unfinished = file.with_name(f"{file.name}.{uuid4().hex[:8]}{UNFINISHED}")
     try:
-        unfinished.unlink(missing_ok=True)  # it may be a link to another file
         stream = AppendedFile(unfinished, length=0)
         try:
             stream.append(content, waits=waits)

@@ -7,7 +7,6 @@ alone call a function, and gives its result, or raises its error, on every rank)
 """
 
 import fcntl
-import json
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.input_files import read_bounded
+from magshell_fenicsx.output.store.durable import Damaged, read_object
 from magshell_fenicsx.platform.processes import on_first_rank
 
 if TYPE_CHECKING:  # a refused case does without
@@ -129,11 +128,9 @@ def refuse_other_tables(
 
 def _json_object(file: Path) -> dict[str, Any]:
     """Return the JSON object in a file; empty if there is none or it cannot be read."""
-    try:
-        content = json.loads(read_bounded(file))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
+    with suppress(OSError, Damaged):
+        return read_object(file)
+    return {}
 
 
 def _is_filled(file: Path) -> bool:

@@ -13,16 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from magshell_fenicsx.output.pictures.picture import PICTURES
-from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, write_whole
+from magshell_fenicsx.output.store import run_identity
+from magshell_fenicsx.output.store.durable import (
+    UNFINISHED,
+    Damaged,
+    read_object,
+    read_result,
+    write_whole,
+)
 from magshell_fenicsx.output.store.folder import refuse_foreign
+from magshell_fenicsx.output.store.run_identity import CHECKPOINT, NEW_CHECKPOINT, SUMMARY
 from magshell_fenicsx.output.store.table import is_path
 
 NAME = "written.txt"
 HEADER = "# files that magshell_fenicsx has written here: another run replaces these alone\n"
 MESH = "mesh.json"  # the mesh chosen for a tolerance
-FILES_OF_PATH = (checkpoint.NAME, "path.csv", MESH)
-NEW_CHECKPOINT = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
+FILES_OF_PATH = (CHECKPOINT, "path.csv", MESH)
 PICTURE_NAMES = (
     *PICTURES,
     "curve",
@@ -40,7 +46,8 @@ RUN_NAMES = re.compile(
     r"|report\.html|animation\.gif|written\.txt"
     rf"|({'|'.join(PICTURE_NAMES)})(_\d{{4,}})?\.(png|svg|pdf)"
     r"|fields(/((path|whole)\.pvd|outlines(_\d{4,})?\.vtp|map_.+\.pvd"
-    r"|((point|whole|map_.+)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
+    r"|((point|whole|map_.+)_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)"
+    rf"((\.[0-9a-f]{{8}})?{re.escape(UNFINISHED)})?"
 )
 
 
@@ -78,17 +85,17 @@ def files_of_runs(folder: Path) -> set[str]:
         name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)
     }
     # files that a killed run has left
-    names = {name for name in regular_names if name.endswith(".unfinished")}
-    if is_replacement_unfinished(folder):
+    names = {name for name in regular_names if name.endswith(UNFINISHED)}
+    if run_identity.is_replacement_unfinished(folder):
         names.add(NEW_CHECKPOINT)
     # files in the manifest
     text = read_result(folder / NAME).decode(errors="replace") if NAME in regular_names else ""
     if text.startswith(HEADER):
         names |= regular_names & {NAME, *text.splitlines()}
-    elif _is_of_run(lambda: read_object(folder / "summary.json")):  # of an earlier version
+    elif _is_of_run(lambda: read_object(folder / SUMMARY)):  # of an earlier version
         return regular_names
     # files of a path; the manifest's own name is in `names` if there is a manifest
-    has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
+    has_checkpoint = _is_of_run(lambda: run_identity.identity_in(folder / CHECKPOINT))
     has_manifest = NAME in names
     has_files_of_path = has_checkpoint
     if not has_checkpoint and not has_manifest:
@@ -98,11 +105,6 @@ def files_of_runs(folder: Path) -> set[str]:
             name for name in regular_names if name in FILES_OF_PATH or name.startswith("fields/")
         }
     return names
-
-
-def is_replacement_unfinished(folder: Path) -> bool:
-    """Whether a run was killed while it removed the files of an earlier run from a folder."""
-    return _is_of_run(lambda: checkpoint.identity_in(folder / NEW_CHECKPOINT))
 
 
 def _is_of_run(read_content: Callable[[], dict[str, Any] | None]) -> bool:

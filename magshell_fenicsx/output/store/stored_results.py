@@ -15,13 +15,12 @@ from pydantic import BaseModel, ValidationError
 
 from magshell_fenicsx.input.messages import explained
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_object
+from magshell_fenicsx.output.store.durable import damage, read_object
+from magshell_fenicsx.output.store.run_identity import CHECKPOINT, SUMMARY, identity_in
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.requests import OutputSection
 
-SUMMARY = "summary.json"
 NUMBER_TYPES, NONE_TYPE = (int, float), type(None)
 PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
 GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
@@ -81,7 +80,7 @@ def case_in(folder: Path) -> dict[str, Any]:
     """
     if (folder / SUMMARY).exists():
         return dict(read_summary(folder)["case"])
-    return dict((checkpoint.identity_in(folder / checkpoint.NAME) or {}).get("case") or {})
+    return dict((identity_in(folder / CHECKPOINT) or {}).get("case") or {})
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -94,7 +93,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     summary = read_object(folder / SUMMARY)
     if wrong := _first_error(summary, SUMMARY_TYPES):
-        raise Damaged(f"{folder / SUMMARY}: is damaged, or of an earlier version: {wrong}")
+        raise damage(folder / SUMMARY, wrong, may_be_earlier=True)
     return summary
 
 

@@ -12,7 +12,15 @@ from math import isnan
 from pathlib import Path
 from typing import Any, TypeVar
 
-from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result, read_result
+from magshell_fenicsx.output.store.durable import (
+    AppendedFile,
+    Damaged,
+    damage,
+    errors_as_damage,
+    open_result,
+    read_result,
+    write_whole,
+)
 from magshell_fenicsx.quantities.registry import OF_EVERY_RUN, amplitude, quantity
 
 COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
@@ -89,7 +97,7 @@ class PathTable:
         content = read_result(file) if file.exists() else b""
         length = content.rfind(b"\n") + 1  # bytes of the header and the complete rows
         if length and not content.startswith(header.encode()):
-            raise Damaged(f"{file}: is damaged: its columns are not those of this run")
+            raise damage(file, "its columns are not those of this run")
         self.complete_rows = read_lines(file) if length else []
         self._file = AppendedFile(file, length)
         if not length:
@@ -131,14 +139,17 @@ def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
-    """Write columns of rows as a CSV file with a header; a missing value is left empty."""
+    """Write columns of rows as a CSV file with a header; a missing value is left empty.
+
+    The complete old or the complete new file exists at every moment (`write_whole`).
+    """
 
     def values_of(row: Mapping[str, Any]) -> list[Any]:
         """Return the values of a row in the columns."""
         return [row.get(column, "") for column in columns]
 
     lines = map(values_of, rows)
-    file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
+    write_whole(file, table_text([columns, *lines]).encode())
 
 
 def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[Read]:
@@ -152,13 +163,12 @@ def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[R
     Raises
     ------
     Damaged
-        If the file is no table, or `convert` raises a KeyError, ValueError or TypeError.
+        If the file is no table, or `convert` raises one of `ERRORS_OF_CONTENT`.
     """
-    try:
-        with file.open(encoding="utf-8", newline="") as stream:
-            return [convert(row) for row in csv.DictReader(stream)]
-    except (KeyError, ValueError, TypeError, csv.Error) as e:
-        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+    content = read_result(file)
+    with errors_as_damage(file):
+        stream = io.StringIO(content.decode(), newline="")
+        return [convert(row) for row in csv.DictReader(stream)]
 
 
 def is_path(file: Path) -> bool:
@@ -201,26 +211,21 @@ def read_lines(file: Path) -> list[dict[str, str]]:
         complete_lines = text[: text.rfind("\n") + 1]  # a killed run may leave a part of a line
         lines = list(csv.reader(io.StringIO(complete_lines, newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as e:
-        raise Damaged(f"{file}: is damaged: no table in UTF-8: {e}") from None
+        raise damage(file, f"no table in UTF-8: {e}") from None
     head = lines[0] if lines else []
     if missing := [name for name in COLUMNS if name not in head]:
-        raise Damaged(
-            f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}"
-        )
+        raise damage(file, f"it has no column {missing[0]}", may_be_earlier=True)
     counts = {name for name in head if quantity(name).kind == "count"}  # columns of whole numbers
     rows = []
     # row `number` is line number + 2 of the file: the header is line 1
     for number, values in enumerate(lines[1:]):
         rows.append(dict(zip(head, values, strict=False)))
         if len(values) != len(head):
-            raise Damaged(
-                f"{file}: is damaged: line {number + 2} has {len(values)} values, "
-                f"its header {len(head)}"
+            raise damage(
+                file, f"line {number + 2} has {len(values)} values, its header {len(head)}"
             )
         if column := _wrong_column(number, rows[-1], counts):
-            raise Damaged(
-                f"{file}: is damaged: line {number + 2} has {column} = {rows[-1][column]!r}"
-            )
+            raise damage(file, f"line {number + 2} has {column} = {rows[-1][column]!r}")
     return rows
 
 
