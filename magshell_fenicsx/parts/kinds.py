@@ -1,71 +1,35 @@
-"""The kinds of bodies, imperfections and sources: each is a file of its package, with its section.
+"""The keys of a case that take one of several kinds: bodies, imperfections and sources.
 
-A new kind is such a file, named after it, and its name here. A section is the part of a case under
-a key, as a pydantic model; its key `kind` chooses the class.
+A section is the part of a case under a key, as a pydantic model; its key `kind` chooses one of the
+classes of the registry.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Self, Union, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Self, Union
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
-from magshell_fenicsx.input.section import ChosenByKey, Section
+from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.bodies.body import BodySection
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection as DimpleSection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import Branches, Time
+from magshell_fenicsx.parts.registry import registered_classes
 from magshell_fenicsx.parts.rubber import LawKeys
 
-if TYPE_CHECKING:
-    from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
 
-REGISTERED: dict[str, tuple[str, ...]] = {
-    # package -> kinds in the order of the documentation
-    "bodies": ("plane", "sphere", "cylinder", "rod", "box", "ellipsoid"),
-    "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
-    "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
-}
-
-
-def section_of(package: str, kind: str) -> type[Section]:
-    """Return the section class of a kind in a package of kinds, such as "bodies".
-
-    It is the one class in the file of the kind with this value of the key `kind`.
-    """
-    module = import_module(f"{__package__}.{package}.{kind}")
-    # what the module itself defines, without what it imports
-    module_members = (
-        member
-        for member in vars(module).values()
-        if getattr(member, "__module__", "") == module.__name__
-    )
-    sections = [
-        member
-        for member in module_members
-        if isinstance(member, type) and issubclass(member, Section)
-    ]
-    # the values of the key's Literal are the kinds of the class: one class has this kind
-    (section,) = (
-        member for member in sections if kind in get_args(member.model_fields["kind"].annotation)
-    )
-    return section
-
-
-def _any_of(package: str) -> Any:
-    """Return the union of the sections of all kinds of a package, chosen by the key `kind`."""
-    sections = tuple(section_of(package, kind) for kind in REGISTERED[package])
-    return Annotated[Union[sections], ChosenByKey("kind")]  # noqa: UP007
+def _any_of(role: str) -> Any:
+    """Return the union of the sections that are registered under a role, chosen by `kind`."""
+    return Annotated[Union[registered_classes(role)], ChosenByKey("kind")]  # noqa: UP007
 
 
 if TYPE_CHECKING:
     Body = BodySection
     Imperfection = ImperfectionSection
     Source = SourceSection
-    Dimple = DimpleSection
 else:
-    Body, Imperfection, Source = map(_any_of, REGISTERED)
-    Dimple = section_of("imperfections", "dimple")
+    Body, Imperfection, Source = map(_any_of, ("bodies", "imperfections", "sources"))
 
 Bodies = Annotated[dict[str, Body], Field(max_length=100)]
 Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.magnetism.fields import MU_0
+from magshell_fenicsx.parts.ability import Account, Context
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.observables import ModelView, Observables, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -56,6 +57,36 @@ class FieldObservables(Observables):
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         """Return no columns: `lambda_m` and `field_angle` are columns of every run."""
         return ()
+
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on the energy of the field and on its sources.
+
+        Lines in `included` tell what is in the model, those in `left_out` what is not, and why.
+        """
+        magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
+        if loads.interaction:
+            words = [
+                "magnetised parts in each other's field, |Br|²/(mu_0 E) = "
+                f"{loads.interaction.strength:g}"
+            ]
+        if magnetic is None or field is None:
+            reason = "lambda_m is zero" if magnetic else "no magnetic section"
+            return Account(included=words, left_out=[f"magnetic energy: {reason}"])
+        law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
+        if field.soft:
+            remanence_text = "without remanence" if field.soft.alone else "beside the remanence"
+            susceptibility = magnetic.susceptibility
+            if isinstance(susceptibility, int | float):
+                susceptibility = f"{susceptibility:g}"
+            law += (
+                f", soft magnetism of a sheet with the susceptibility {susceptibility} "
+                f"{remanence_text}"
+            )
+            law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
+        sources = enumerate(magnetic.applied.sources or [])
+        words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
+        energy_text = f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}"
+        return Account(included=[energy_text, *words])
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return strength and angle of the applied field at a state, column -> value."""
