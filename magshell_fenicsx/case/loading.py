@@ -58,15 +58,11 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     """
     implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):  # in a list the author has written all steps
-        # pairs (key, load): natural shape and field, as far as the case has them
-        # the load's own kind, and what its history drives, do not grow before it
-        kinds = [
-            kind
-            for kind in STEPS.values()
-            if kind.rank_before_load and not isinstance(loading, kind)
-        ]
+        kinds = [kind for kind in STEPS.values() if kind.rank_before_load]
         for kind in sorted(kinds, key=lambda kind: kind.rank_before_load):
-            if getattr(kind, "amplitude", "") not in _driven_by_history(loading):
+            # what the load drives itself does not grow before it
+            by_history = getattr(kind, "amplitude", "") in _driven_by_history(loading)
+            if not (isinstance(loading, kind) or by_history):
                 implied_steps += kind.steps_before_load(context)
     keyed_loads = [*implied_steps, *loads_by_key(loading).items()]
     loads = [load for _, load in keyed_loads]

@@ -1,5 +1,5 @@
-"""Observables: what parts observe of a state, as columns of path.csv, maps and lines of
-summary.json; and the units of what is conjugate to amplitudes.
+"""Observables: what parts observe of a state, as columns of path.csv; and the units of what is
+conjugate to amplitudes.
 
 An amplitude mu is a load parameter, by name; its conjugate -dPi/dmu is the displacement on which it
 does work. Pi is the energy, and Pi_i the potential of amplitude i, its derivative. R is the
@@ -10,7 +10,7 @@ path.csv.
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -228,29 +228,6 @@ class Observables:
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return column -> value of the part at a state; by default its free amplitudes."""
         return {name: state.mu[name] for name in self.free_amplitudes(view.loads)}
-
-    def grids(self, loads: "Loads") -> Sequence[str]:
-        """Return the names of the grids in space on which the part observes a field."""
-        return ()
-
-    def on_grids(self, view: ModelView, state: "State") -> Sequence[MapGrid]:
-        """Return the grids of the part with the fields at a state; collective."""
-        return ()
-
-    def differentiable(self, loads: "Loads") -> Sequence[str]:
-        """Return the part's columns that have a `slope`."""
-        return ()
-
-    def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
-        """Return a column at a state with its derivatives; collective.
-
-        None if the column belongs to another part.
-        """
-        return None
-
-    def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
-        """Return the part's entries of summary.json about the end of a path; collective."""
-        return {}
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """Return -dPi/dmu of one unit of the conjugate of the amplitude `name`.

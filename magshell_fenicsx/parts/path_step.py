@@ -176,14 +176,14 @@ class PathStep(Step):
             )
 
     @classmethod
-    def level(cls, text: str, context: Context) -> float:
+    def history_value(cls, text: str, context: Context) -> float:
         """Return a value of a history with a unit, converted as a target of the load."""
         # the type of the key of a load's target says how text with a unit is converted
         for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
             annotation = cls.model_fields[key].annotation
             if is_over_unit(annotation):
                 return over_unit(annotation, text, context.shell)
-        return super().level(text, context)
+        return super().history_value(text, context)
 
     @property
     def end(self) -> StepEnd:

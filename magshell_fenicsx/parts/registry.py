@@ -53,7 +53,6 @@ REGISTERED: dict[str, tuple[str, ...]] = {
         "magnetism.readings.SoftObservables",
         "magnetism.interaction.InteractionObservables",
         "magnetism.readings.SensorsObservables",
-        "magnetism.field_maps.FieldMapsObservables",
         "bodies.contact_step.BodiesObservables",
         "contact.contact_observables.ContactObservables",
         "joints.CreaseObservables",

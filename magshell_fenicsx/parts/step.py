@@ -110,7 +110,7 @@ class Step(Part):
         return any(target.squared for target in self.targets.values())
 
     @classmethod
-    def level(cls, text: str, context: Context) -> float:
+    def history_value(cls, text: str, context: Context) -> float:
         """Return a value of a history, given as text with a unit, in the unit of the target.
 
         A history gives a load as a function of time.

@@ -62,7 +62,7 @@ class FieldSection(FactorStep):
         return load_start.size
 
     @classmethod
-    def level(cls, text: str, context: Context) -> float:
+    def history_value(cls, text: str, context: Context) -> float:
         """Return a flux density as a factor of that of `magnetic.applied`.
 
         `text` is a number with a unit, a value of a load as a function of time.

@@ -290,4 +290,4 @@ def level_in(context: Context, name: str, level: Level) -> float:
         return level
     # units are known to the kind of the load's step: of the step that the case has, else by name
     step_kind = next((type(step.load) for step in context.steps if step.name == name), None)
-    return (step_kind or step_class_of(name)).level(level, context)
+    return (step_kind or step_class_of(name)).history_value(level, context)
