@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import magshell_fenicsx
-from magshell_fenicsx.parts.registered import ABILITIES, KINDS_OF_STEPS, REGISTERED
+from magshell_fenicsx.parts.registry import REGISTERED
 
 PACKAGE = Path(magshell_fenicsx.__file__).parent
 PARTS = f"{PACKAGE.name}.parts"
-REGISTRY = {"kinds", "registered"}  # modules by which others find parts
+REGISTRY = {"kinds", "registered", "registry"}  # modules by which others find parts
 MODELS_AND_TERMS = {
     "OwnTerm",
     "Magnetisation",
@@ -85,7 +85,7 @@ def test_parts_do_not_know_each_other() -> None:
     What parts share names types of parts: the sum of all loads, a model as parts observe it.
     """
     parts = {file.stem for file in (PACKAGE / "parts").iterdir() if file.is_dir()} - {"__pycache__"}
-    parts |= {path.split(".")[0] for path in (*REGISTERED, *KINDS_OF_STEPS.values(), *ABILITIES)}
+    parts |= {path.split(".")[0] for role in ("abilities", "steps") for path in REGISTERED[role]}
     arrows = set[tuple[str, str]]()
     for name, tree in trees("parts"):
         own = Path(name).parts[1].removesuffix(".py")

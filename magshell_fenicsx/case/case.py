@@ -25,6 +25,7 @@ from pydantic import (
     model_validator,
 )
 
+from magshell_fenicsx.case.case_base import Origin, WithParts
 from magshell_fenicsx.case.loading import (
     Loading,
     loads_by_key,
@@ -57,7 +58,7 @@ from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.natural.section import NaturalSection
-from magshell_fenicsx.parts.registered import PART_CLASSES, Origin, WithParts
+from magshell_fenicsx.parts.registered import PART_CLASSES
 from magshell_fenicsx.parts.revolution_sections import CapSurface, RevolutionSurface
 from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.parts.step import ProgrammeStep

@@ -14,7 +14,9 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.registered import FORMER_KINDS, KINDS_BEFORE_LOAD, STEPS
+from magshell_fenicsx.parts.bodies.contact_step import ContactSection, approaches
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
+from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
 from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import Gas
@@ -56,28 +58,32 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     """
     implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):  # in a list the author has written all steps
-        # pairs (key, load): natural shape and field, as far as the case has them
-        implied_steps = [
-            pair
-            for kind in KINDS_BEFORE_LOAD
-            for pair in STEPS[kind].steps_before_load(context, loading)
-        ]
+        kinds = [kind for kind in STEPS.values() if kind.rank_before_load]
+        for kind in sorted(kinds, key=lambda kind: kind.rank_before_load):
+            # what the load drives itself does not grow before it
+            by_history = getattr(kind, "amplitude", "") in _driven_by_history(loading)
+            if not (isinstance(loading, kind) or by_history):
+                implied_steps += kind.steps_before_load(context)
     keyed_loads = [*implied_steps, *loads_by_key(loading).items()]
     loads = [load for _, load in keyed_loads]
     places_of_amplitude = dict[str, list[Any]]()  # different places, in the order of the steps
     steps = []
     for number, (key, load) in enumerate(keyed_loads, 1):
-        name = load.name_in(context, loads)
-        # without a name of its own a step has that of its amplitude. Loads of one kind at different
-        # places get numbers: force, force_2, ...
-        if name is None:
+        if isinstance(load, ContactSection):  # a body has one approach, whatever step moves it
+            name = load.approach_in(approaches(context.sections["bodies"], loads))
+        else:  # loads of one kind at different places get numbers: force, force_2, ...
             places = places_of_amplitude.setdefault(load.amplitude, [])
             if load.place not in places:
                 places.append(load.place)
             number_of_place = places.index(load.place) + 1
             name = load.amplitude + (f"_{number_of_place}" if number_of_place > 1 else "")
-        steps.append(ProgrammeStep(number, name, key, load))
+        steps.append(ProgrammeStep(number, name, key, load, _driven_by_history(load)))
     return tuple(steps)
+
+
+def _driven_by_history(load: Step | None) -> tuple[str, ...]:
+    """Return the amplitudes that follow histories in a load; none but in a motion."""
+    return load.drives if isinstance(load, TimeSection) else ()
 
 
 def refuse_unfit_steps(context: Context) -> None:
@@ -90,10 +96,9 @@ def refuse_unfit_steps(context: Context) -> None:
     """
     for step in context.steps:
         load, key = step.load, step.key
-        load.refuse_unfit(step, context)
+        load.refuse_unfit(context.at_step(step))
         # the first step that drives an amplitude begins at zero, so that its goal must not be zero
-        goal = load.target or load.limit_target  # (what is prescribed, its value at the end)
-        _, goal_value = goal or (None, None)
+        _, goal_value = load.end.goal or (None, None)
         if step.name not in context.driven_before(step.number) and goal_value == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the "
@@ -102,8 +107,8 @@ def refuse_unfit_steps(context: Context) -> None:
         # a static step needs equilibrium at its begin: after a motion the shell must have come to
         # rest
         earlier_steps = context.steps_before(step.number)
-        begins_in_motion = bool(earlier_steps) and not earlier_steps[-1].load.rests
-        if begins_in_motion and not load.in_time:
+        begins_in_motion = bool(earlier_steps) and not earlier_steps[-1].load.end.at_rest
+        if begins_in_motion and not isinstance(load, TimeSection):
             kind = earlier_steps[-1].kind
             raise ValueError(
                 f"{key}: begins in equilibrium: the step of kind: {kind} before it needs "
@@ -120,7 +125,7 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
     # amplitude -> the load that drives it; a pressure can be held even where no step applies one
     holdable_loads: dict[str, Step | None] = {"pressure": None}
     holdable_loads |= {any_step.name: any_step.load for any_step in steps if any_step.load.holdable}
-    if step.load.in_time:  # its amplitude is the time
+    if isinstance(step.load, TimeSection):  # its amplitude is the time
         holdable_loads.pop(step.name)
     to_limit = step.until == "limit"
     # a step that ends at an instability may hold the conjugate of its own amplitude
@@ -134,7 +139,7 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         may_hold_own = to_limit and holds_conjugate
         if name == step.name and not may_hold_own:
             raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
-        if name == step.name and step.load.limit_target:
+        if name == step.name and step.load.end.bound:
             raise ValueError(
                 f"{key}: conjugate: the way to the instability has no end: leave out the target"
             )
@@ -163,7 +168,7 @@ def _refuse_unfit_conjugate(key: str, load: Step, step: ProgrammeStep) -> None:
     step
         The step that would hold the conjugate.
     """
-    if not load.held_conjugate:
+    if not load.conjugate:
         raise ValueError(
             f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
         )
@@ -171,7 +176,7 @@ def _refuse_unfit_conjugate(key: str, load: Step, step: ProgrammeStep) -> None:
     # motion, and where it is released at the end of a step
     if not load.released:
         return
-    if step.load.in_time or step.load.released_by:
+    if isinstance(step.load, TimeSection) or step.load.end.snap:
         raise ValueError(f"{key}: conjugate: {load.released}")
 
 

@@ -130,10 +130,8 @@ def symmetry_constraints(
     """
     context, shell = case.context, case.shell
     constraints = [shape_constraint(shell.geometry, shell.thickness_factor, outline)]
-    for section in context.abilities:
-        constraints += section.symmetry_constraints(context, outline)
-    for step in case.programme:
-        constraints += step.load.symmetry_constraints(step, context, outline)
+    for contributor, view in context.contributors():
+        constraints += contributor.symmetry_constraints(view, outline)
     constraints.append(points_constraint(case.points.values(), case.shell.reference, outline))
     constraints += [term.symmetry_constraint(outline) for term in energies]
     return constraints

@@ -49,6 +49,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.ability import Modelled
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.body_setup import ContactZone, body_symmetry, contact_bodies
+from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     imperfection_geometries,
@@ -64,10 +65,11 @@ from magshell_fenicsx.parts.imperfections.symmetry import (
 )
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.registered import STEPS
+from magshell_fenicsx.parts.pressure.pressure import PressureSection
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
-from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import ChartOfPlace
 from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
     PlacedFormulas,
@@ -91,7 +93,7 @@ Array = NDArray[np.float64]
 MIN_SIZE_AT_TIP = 0.05  # size of elements at the tip of a sector, over the largest
 # times the radius, or a part of it: a surface as long as that hints at another unit
 MAX_EXTENT_OVER_RADIUS = 50.0
-StepsAtPlaces = dict[str, tuple[ProgrammeStep, Array]]  # by name of a step; places (3,) over R
+StepsAtPlaces = Sequence[tuple[ProgrammeStep, str | ChartOfPlace]]  # see `Step.concentrated`
 
 
 def make_problem(
@@ -253,7 +255,7 @@ def _problem(
         supports=supports,
         reactions=bool(loads.moves) if case.reactions is None else case.reactions,
         body_contacts=tuple((region.size, region.reach) for region in mesh.contact_regions),
-        warnings=_warnings(case, places, shell.reference.perfect),
+        warnings=_warnings(case, places),
         lambda_m=case.lambda_m,
         unknowns=unknowns,
         patched=bool(case.patches),
@@ -412,11 +414,8 @@ class _ImperfectShell:
         material, reference = _material(case), reference_shell_of(case.shell)
         imperfections = imperfection_geometries(case.imperfections, reference)
         # the keys of imperfections whose deviation a step multiplies
-        last_steps = {step.name: step for step in case.programme}
-        growing_keys = {
-            key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
-        }
-        constant = {*imperfections} - growing_keys
+        grown_keys = grown_by(case.context.last_steps.values(), imperfections)
+        constant = {*imperfections}.difference(*grown_keys.values())
         outline = _imperfect_outline(reference.perfect, imperfections, constant, turn=0.0)
         sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else outline.sample()
         reference = replace(reference, imperfect=outline)
@@ -484,16 +483,12 @@ def _imperfect_outline(
 
 
 def _load_places(case: Case, outline: Outline) -> StepsAtPlaces:
-    """Return name -> (step, place) of the steps that load a single place.
-
-    Places (3,) are over R. Of several steps with one name the last one counts.
-    """
-    places: StepsAtPlaces = {}
-    for name, step in {step.name: step for step in case.programme}.items():
-        place = step.load.place_on(step, case.context, outline)
-        if place is not None:
-            places[name] = step, place
-    return places
+    """Return (step, place) for each place where a load is concentrated."""
+    return [
+        (step, place)
+        for step in case.programme
+        for place in step.load.concentrated(case.context.at_step(step), outline)
+    ]
 
 
 @dataclass(frozen=True)
@@ -564,11 +559,14 @@ class _VertexPoints:
     charts
         Name of a point -> its place (2 | 3,) in the chart.
     of_steps
-        Name of a step that loads a single place -> name of the point in `charts` at that place.
+        Name of a step that loads a place of its own -> name of the point in `charts` there.
+    loads_at_points
+        Named points of the case, each with a load that is concentrated there.
     """
 
     charts: dict[str, Array]
     of_steps: dict[str, str]
+    loads_at_points: Sequence[tuple[str, Step]]
 
     @classmethod
     def of_case(
@@ -579,19 +577,23 @@ class _VertexPoints:
         Parameters
         ----------
         load_places
-            Name of a step -> the step and the place of its load.
+            Steps and the places of their loads.
         outline, part
             The shell in the frame of the case, and the part that is modelled.
 
         Raises
         ------
         CaseError
-            If a named point is not on the surface, or there is no room for a load.
+            If a named point is not on the surface.
         """
         charts = named_points(case, outline, part.turn, part.mirror)
         of_steps = dict[str, str]()
-        for name, (step, place) in load_places.items():
-            chart = step.load.chart_of(place, outline, part.turn, half=part.is_symmetric)
+        loads_at_points = list[tuple[str, Step]]()
+        for step, place in load_places:
+            if isinstance(place, str):
+                loads_at_points.append((place, step.load))
+                continue
+            name, chart = step.name, place(part.turn, part.is_symmetric)
             chart = on_features(chart, outline, charts)
             # a load at the pole, or at the place of an earlier load, shares the point there. Else
             # it gets a point with the name of its step, in which "load" replaces "force"
@@ -599,20 +601,12 @@ class _VertexPoints:
             at_same_place = (point for point in candidates if np.array_equal(charts[point], chart))
             of_steps[name] = next(at_same_place, name.replace("force", "load"))
             charts[of_steps[name]] = chart
-        for step in case.programme:
-            if step.name in of_steps:
-                chart = charts[of_steps[step.name]]
-                step.load.refuse_unfit_place(step, case.context, outline, chart)
-        return cls(charts, of_steps)
+        return cls(charts, of_steps, loads_at_points)
 
     def concentrated_loads(self, case: Case) -> list[Loaded]:
         """Return (chart, loads there) for each point with a concentrated load."""
         # loads that name a point of the case, then loads at a place of their own
-        loads: list[Loaded] = [
-            (self.charts[point], [step.load])
-            for step in case.programme
-            for point in step.load.named_points()
-        ]
+        loads: list[Loaded] = [(self.charts[point], [load]) for point, load in self.loads_at_points]
         for point in dict.fromkeys(self.of_steps.values()):  # each point once, with all its loads
             loads_there = [
                 step.load for step in case.programme if self.of_steps.get(step.name) == point
@@ -874,32 +868,17 @@ def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> fl
 def _loads(case: Case, modelled: Modelled) -> Loads:
     """Return the loads of the model: the sum of what abilities and load steps contribute.
 
-    Of several steps with one name the last one contributes. In the sum, dictionaries and tuples are
-    joined; of other values the first one that is set counts.
+    Of several steps with one name the last one contributes.
     """
-    context, last_steps = case.context, {step.name: step for step in case.programme}
-    # names of all amplitudes: those of steps, and others that a step drives or holds
-    amplitudes = set(last_steps)
-    for step in case.programme:
-        amplitudes.update(step.load.drives, step.load.hold)
-    # what amplitudes need, by the kind of step that drives them; then what steps and abilities add.
-    # Each addition maps names of attributes of `Loads` to values
-    additions = [
-        kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in amplitudes
-    ]
-    additions += [step.load.adds(step, context, modelled) for step in last_steps.values()]
-    additions += [section.adds(context, modelled) for section in context.abilities]
-    sums: dict[str, Any] = {}
-    for addition in additions:
-        for name, value in addition.items():
-            earlier_value = sums.get(name)
-            if isinstance(value, dict):
-                sums[name] = {**(earlier_value or {}), **value}
-            elif isinstance(value, tuple):
-                sums[name] = (*(earlier_value or ()), *value)
-            else:
-                sums[name] = earlier_value or value
-    return Loads(**sums)
+    context = case.context
+    # amplitudes of steps, and others that a step drives or holds
+    amplitudes = {name for step in context.steps for name in (step.name, *step.drives)}
+    amplitudes.update(name for step in context.steps for name in step.load.hold)
+    loads = Loads(pressure=PressureSection.amplitude in amplitudes)
+    for contributor, view in context.contributors(last_steps=True):
+        if contribution := contributor.contribution(view, modelled):
+            loads += contribution
+    return loads
 
 
 def _thickness(case: Case, turn: float) -> Thickness | None:
@@ -925,20 +904,13 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     return Thickness(in_model_frame, formulas=formula_group([in_case_frame], Q))
 
 
-def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
+def _warnings(case: Case, places: Array) -> tuple[str, ...]:
     """Return warnings about input that is unphysical, or that is often meant in another way.
 
-    Parameters
-    ----------
-    places
-        Places (n, 3) over R, all over the undeformed shell.
-    outline
-        The perfect shell.
+    `places` (n, 3) over R are all over the undeformed shell.
     """
-    context = case.context
-    warnings = [ability.warning(context, places) for ability in context.abilities]
-    R = case.shell.reference
-    warnings += [step.load.warning(step, outline, R) for step in case.programme]
+    contributors = case.context.contributors()
+    warnings = [contributor.warning(context, places) for contributor, context in contributors]
     warnings.append(_unit_warning(case, places))
     return tuple(warning for warning in warnings if warning)
 

@@ -1,7 +1,8 @@
 """The base of parts and of all other abilities: what a section of a case adds to a problem.
 
-An ability reads its section and the rest of the case (`Context`). It gives fields of the model's
-`Loads`, the symmetry that it preserves, its formulas, and its lines for `magshell check`.
+An ability reads its section and the rest of the case (`Context`). It contributes to the model's
+`Loads`, and gives its energies, the symmetry that it preserves, its formulas, and its lines for
+`magshell check`. Sections and the loads of steps are abilities alike.
 
 An offer is a property of a case that some abilities need, such as "a mid-surface", and others
 withdraw. A programme is the list of the case's steps, its loads one after the other; each drives an
@@ -9,8 +10,8 @@ amplitude (a load parameter, by name). R, h and E are reference length, thicknes
 modulus.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import numpy as np
@@ -19,13 +20,14 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.quantities.quantity import CaseSizes, Quantity
+from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import Deviation
     from magshell_fenicsx.models.shell.spatial_fields import InsideRim
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline
@@ -74,6 +76,8 @@ class Context:
         Whether the programme is a list of the case file, so that no step comes before it.
     solid
         Whether the body is modelled in three dimensions.
+    current_step
+        The step whose load reads the case; None where a section reads it.
     """
 
     shell: "ShellSection | Surface"
@@ -82,6 +86,22 @@ class Context:
     steps: "Sequence[ProgrammeStep]" = field(default=())
     is_programme: bool = True
     solid: bool = False
+    current_step: "ProgrammeStep | None" = None
+
+    @property
+    def step(self) -> "ProgrammeStep":
+        """The step whose load reads the case; loads alone may ask for it."""
+        assert self.current_step is not None
+        return self.current_step
+
+    def at_step(self, step: "ProgrammeStep") -> "Context":
+        """Return the case as the load of a step reads it."""
+        return replace(self, current_step=step)
+
+    @property
+    def last_steps(self) -> "dict[str, ProgrammeStep]":
+        """Amplitude -> the last step that drives it, which counts where several drive one."""
+        return {step.name: step for step in self.steps}
 
     def section_of(self, kind: type[Kind]) -> Kind | None:
         """Return the first section of the case that is of a class; None without one."""
@@ -108,6 +128,15 @@ class Context:
         if self.solid:
             advice_by_offer["a mid-surface"] = "a solid has none: take model: shell"
         return advice_by_offer
+
+    def contributors(self, *, last_steps: bool = False) -> "list[tuple[Ability, Context]]":
+        """Return all abilities, then the loads of steps, each with the case as it reads it.
+
+        `last_steps` is whether of several steps with one name the last one counts alone.
+        """
+        steps = self.last_steps.values() if last_steps else self.steps
+        loads = [(step.load, self.at_step(step)) for step in steps]
+        return [*((ability, self) for ability in self.abilities), *loads]
 
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
         """Check that the case has the offers that a key needs.
@@ -143,11 +172,9 @@ class Context:
         """Return the amplitudes that steps before the step with a number have driven.
 
         A step drives the amplitude of its name, and perhaps amplitudes of other steps
-        (`load.drives`).
+        (`ProgrammeStep.drives`).
         """
-        return {
-            name for step in self.steps_before(number) for name in (step.name, *step.load.drives)
-        }
+        return {name for step in self.steps_before(number) for name in (step.name, *step.drives)}
 
     def has_modulus(self, what: str) -> None:
         """Check that the shell has a Young's modulus; `what` names the thing that needs it.
@@ -301,22 +328,6 @@ Offer = Literal[
 ]
 
 
-@dataclass(frozen=True)
-class InTime:
-    """A load that may be a function of time in a step of `kind: time`, though no step drives it.
-
-    Attributes
-    ----------
-    name
-        Name of the load in `history`.
-    refused
-        Why it may not be a function of time in this case; empty if it may.
-    """
-
-    name: str
-    refused: str
-
-
 class Ability:
     """The base of what adds something to a problem, mostly a section of the case file.
 
@@ -346,18 +357,6 @@ class Ability:
         """
         return {}
 
-    def in_time(self, context: Context, driven_amplitudes: Collection[str]) -> InTime | None:
-        """Return the ability's load that may be a function of time in a step of `kind: time`.
-
-        None without such a load. A step's own load is a function of time anyway.
-
-        Parameters
-        ----------
-        driven_amplitudes
-            The amplitudes that steps before have driven.
-        """
-        return None
-
     def patches(self) -> dict[str, Iterable[str]]:
         """Return the ability's keys with values by patch -> the names of these patches."""
         return {}
@@ -372,9 +371,17 @@ class Ability:
         """Return the ability's formulas of the undeformed place."""
         return []
 
-    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return fields of the model's `Loads`, to which those of other abilities are added."""
-        return {}
+    def terms(self, context: Context) -> Sequence[OwnTerm]:
+        """Return the ability's energies that follow from densities, each with its amplitude."""
+        return []
+
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads | None":
+        """Return what the ability adds to the loads of the model; None if it adds nothing."""
+        return None
+
+    def account(self, context: Context) -> str:
+        """Return the ability's line of `magshell check`; empty if other lines say everything."""
+        return ""
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Check the ability's values at places (n, 3) over R of the undeformed shell.
@@ -392,10 +399,6 @@ class Ability:
     def numbers(self, context: Context) -> list[str]:
         """Return lines of `magshell check` with the ability's numbers on the undeformed shell."""
         return []
-
-    def units(self, context: Context, units: CaseSizes) -> CaseSizes:
-        """Return sizes of units, completed by those that the ability defines."""
-        return units
 
 
 @dataclass(frozen=True)
@@ -420,37 +423,26 @@ class KeyAbility(Ability, Generic[Kind]):
 
 
 class Part(Section, Ability):
-    """A section of the case file whose energies are integrals over the mid-surface.
+    """A section of the case file that adds something, and its columns of path.csv.
 
-    A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys
-    appear in docs/case.md. `OwnTerm` finds the arguments, the symmetry and the derivatives of its
-    densities, so a part works in every model.
+    Its docstring and those of its keys appear in docs/case.md. `OwnTerm` finds the arguments, the
+    symmetry and the derivatives of its densities, so its energies hold in every model.
 
     Attributes
     ----------
     quantities
-        The columns that it adds to path.csv: the amplitude of each term under its name, and the
-        observed integrals.
+        The columns that it adds: the amplitude of each term under its name, and the observed
+        integrals.
+    key
+        Its key in the case, which follows from the registry; not of steps.
     absent
-        The line of `magshell check` for a case without the part.
+        The line of `magshell check` for a case without the section; empty for none.
     """
 
-    quantities: ClassVar[tuple[Quantity, ...]]
-    absent: ClassVar[str]
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
+    key: ClassVar[str]
+    absent: ClassVar[str] = ""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
         register(cls.quantities)
-
-    def refuse_unfit(self, context: Context) -> None:
-        context.has_modulus(
-            next(key for key, section in context.sections.items() if section is self)
-        )
-
-    def terms(self, scales: Scales) -> Sequence[OwnTerm]:
-        """Return the energies of the part, each with the value of its amplitude in these scales."""
-        raise NotImplementedError
-
-    def account(self, scales: Scales) -> str:
-        """Return the line of `magshell check` for a case with the part."""
-        raise NotImplementedError

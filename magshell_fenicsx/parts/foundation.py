@@ -74,6 +74,7 @@ class Foundation(Part):
             (STIFFNESS,),
         ),
     )
+    key = "foundation"
     absent = "foundation: none"
 
     @model_validator(mode="after")
@@ -90,12 +91,18 @@ class Foundation(Part):
             else []
         )
 
-    def terms(self, scales: Scales) -> list[OwnTerm]:
+    def refuse_unfit(self, context: Context) -> None:
+        context.has_modulus(self.key)
+
+    def terms(self, context: Context) -> list[OwnTerm]:
         """Return the energies of the springs that are given, along the normal and in the surface.
 
         Their amplitudes are the stiffnesses over E h/R².
         """
-        stiffnesses = self._dimensionless(scales)  # those of "k" and "k_t" that are given
+        scales, stiffnesses = (
+            context.scales,
+            self._dimensionless(context.scales),
+        )  # those of "k" and "k_t" that are given
         energies = list[OwnTerm]()
         factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
         # the springs along the normal also have a column of results, with the density `reaction`
@@ -110,9 +117,10 @@ class Foundation(Part):
             )
         return energies
 
-    def account(self, scales: Scales) -> str:
+    def account(self, context: Context) -> str:
         stiffnesses = ", ".join(
-            f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items()
+            f"{name} R²/(E h) = {value:.6g}"
+            for name, value in self._dimensionless(context.scales).items()
         )
         return f"Winkler foundation, {stiffnesses}{', times a formula' if self.factor else ''}"
 

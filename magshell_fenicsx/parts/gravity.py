@@ -11,7 +11,6 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.platform.lazy_import import lazy_import
 from magshell_fenicsx.quantities.quantity import NEEDS_DENSITY, Quantity, Unit
@@ -76,16 +75,16 @@ class GravityStep(BodyForceStep):
         return unit(np.array(self.direction))
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         return [SymmetryConstraint(vectors=[self._unit_direction])]
 
-    def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        return [OwnTerm(step.name, weight_energy, (self._unit_direction,), of_volume=True)]
+    def terms(self, context: Context) -> list[OwnTerm]:
+        return [OwnTerm(context.step.name, weight_energy, (self._unit_direction,), of_volume=True)]
 
-    def account(self, step: ProgrammeStep, context: Context) -> str:
+    def account(self, context: Context) -> str:
         components = ", ".join(f"{c + 0.0:.3g}" for c in self._unit_direction)
-        return f"the shell's weight along [{components}], amplitude {step.name} = ρ g R/E"
+        return f"the shell's weight along [{components}], amplitude {context.step.name} = ρ g R/E"
 
 
 def weight_energy(r0: Jet, u: Jet, direction: "Expr") -> "Expr":

@@ -11,7 +11,7 @@ A density is an energy per area or length as a function of jets: maps with their
 point. `plus` and `minus` are the two sides of an edge.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, radians
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -22,7 +22,6 @@ from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.path_step import FactorStep
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -143,8 +142,10 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
             )
         ]
 
-    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return the joints as the model's `Loads` have them, with stiffnesses over E h R."""
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the joints, with stiffnesses over E h R."""
+        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
+
         # a case without springs may have no units, hence no scales
         scales = context.scales if any(section.stiffness for section in self.sections) else None
         joints = list[Joint]()
@@ -160,7 +161,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                     angle=None if section.angle is None else radians(section.angle),
                 )
             )
-        return {"joints": tuple(joints)}
+        return Loads(joints=tuple(joints))
 
 
 def _refuse_unfit_t_junction(number: int, section: JointSection, shells: Sequence[str]) -> None:
@@ -222,11 +223,6 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
         )
 
 
-def account(context: Context, loads: "Loads") -> Account:
-    """Return the lines of `magshell check` on joints: which edges are joined, and how."""
-    return Account([_words(joint) for joint in loads.joints])
-
-
 def _words(joint: Joint) -> str:
     """Return which edges a joint joins, and how."""
     kind = "rigidly" if joint.rigid else "by a hinge"
@@ -242,6 +238,7 @@ class CreaseStep(FactorStep):
 
     amplitude: ClassVar[str] = AMPLITUDE
     section: ClassVar[str] = "joints"
+    rank_before_load: ClassVar[int] = 2
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
@@ -260,9 +257,9 @@ class CreaseStep(FactorStep):
         """Return whether a spring has an angle of its own."""
         return any(section.angle is not None for section in context.sections.get("joints") or ())
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         if not self.asked_for(context):
-            raise ValueError(f"{step.key}.kind: crease: needs a joint with an angle")
+            raise ValueError(f"{context.step.key}.kind: crease: needs a joint with an angle")
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         return (
@@ -274,8 +271,12 @@ class CreaseStep(FactorStep):
 class CreaseObservables(Observables):
     """The observable of creases: how far their angles have grown."""
 
-    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
-        return (AMPLITUDE,) if any(joint.angle is not None for joint in loads.joints) else ()
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on joints: which edges are joined, and how."""
+        return Account([_words(joint) for joint in loads.joints])
+
+    def free_amplitudes(self, loads: "Loads") -> Mapping[str, float]:
+        return {AMPLITUDE: 0.0} if any(joint.angle is not None for joint in loads.joints) else {}
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
-"""The kinds of bodies, imperfections, sources and laws: each is a file, with its section.
+"""The keys of a case that take one of several kinds: bodies, imperfections, sources and laws.
 
-A new kind is such a file, named after it, and its name here. A section is the part of a case under
-a key, as a pydantic model; its key `kind` chooses the class, of laws the key `law` of a shell.
+A section is the part of a case under a key, as a pydantic model; its key `kind` chooses one of the
+classes of the registry, of laws the key `law` of a shell.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union, get_args, get_origin
 
 from pydantic import (
     Field,
@@ -19,67 +18,40 @@ from pydantic import (
 from magshell_fenicsx.input.messages import meaning
 from magshell_fenicsx.input.section import ChosenByKey, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection as DimpleSection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.laminate import LaminateSection
 from magshell_fenicsx.parts.laws.law_section import LawSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.history import Branches, Time
+from magshell_fenicsx.parts.registry import registered_classes
 
-if TYPE_CHECKING:
-    from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
 
-REGISTERED: dict[str, tuple[str, ...]] = {
-    # package -> kinds in the order of the documentation
-    "bodies": ("plane", "sphere", "cylinder", "rod", "box", "ellipsoid"),
-    "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
-    "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
-    "laws": ("koiter", "neo-hookean", "mooney-rivlin", "ogden"),
+def _any_of(role: str) -> Any:
+    """Return the union of the sections that are registered under a role, chosen by `kind`."""
+    return Annotated[Union[registered_classes(role)], ChosenByKey("kind")]  # noqa: UP007
+
+
+LAWS: dict[str, type[LawSection]] = {  # by their names, the values of the key `law`
+    name: section
+    for section in registered_classes("laws")
+    for name in get_args(section.model_fields["law"].annotation)
 }
-
-
-def section_of(package: str, kind: str) -> type[Section]:
-    """Return the section class of a kind in a package of kinds, such as "bodies".
-
-    It is the one class in the file of the kind with this value of the key `kind`, or `law`.
-    """
-    module = import_module(f"{__package__}.{package}.{kind.replace('-', '_')}")
-    key = "law" if package == "laws" else "kind"
-    # classes that the module itself defines; `isinstance` would import a lazy module
-    classes = [member for member in vars(module).values() if issubclass(type(member), type)]
-    own_classes = [member for member in classes if member.__module__ == module.__name__]
-    sections: list[type[Section]] = [each for each in own_classes if issubclass(each, Section)]
-    # the values of the key's Literal are the kinds of the class: one class has this kind
-    (section,) = (
-        member for member in sections if kind in get_args(member.model_fields[key].annotation)
-    )
-    return section
-
-
-def _any_of(package: str) -> Any:
-    """Return the union of the sections of all kinds of a package, chosen by the key `kind`."""
-    sections = tuple(section_of(package, kind) for kind in REGISTERED[package])
-    return Annotated[Union[sections], ChosenByKey("kind")]  # noqa: UP007
-
 
 if TYPE_CHECKING:
     Body = BodySection
     Imperfection = ImperfectionSection
     Source = SourceSection
-    Dimple = DimpleSection
     LawName = str
 else:
-    Body = _any_of("bodies")
-    Imperfection = _any_of("imperfections")
-    Source = _any_of("magnetism.sources")
-    Dimple = section_of("imperfections", "dimple")
-    LawName = Literal[REGISTERED["laws"]]
+    Body, Imperfection, Source = map(_any_of, ("bodies", "imperfections", "sources"))
+    LawName = Literal[tuple(LAWS)]
 
 Bodies = Annotated[dict[str, Body], Field(max_length=100)]
 Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 
 
-LAWS = {name: cast("type[LawSection]", section_of("laws", name)) for name in REGISTERED["laws"]}
 SECTION_BY_KEY = {key: section for section in LAWS.values() for key in section.own_keys()}
 LAW_KEYS = tuple(SECTION_BY_KEY)
 

@@ -1,8 +1,8 @@
 """All loads of a shell, dimensionless: the sum of what the parts of a problem contribute."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any
 
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Loads:
-    """The loads of a shell; what is empty, None or False has no term and no kernel.
+    """The loads of a shell, or what one part contributes to them.
+
+    What is empty, None or False has no term and no kernel.
 
     Attributes
     ----------
@@ -83,6 +85,22 @@ class Loads:
     interaction: "Interaction | None" = None
     pairs: "tuple[Pair, ...]" = ()
     joints: "tuple[Joint, ...]" = ()
+
+    def __add__(self, other: "Loads") -> "Loads":
+        """Return the sum of both: mappings and tuples are joined.
+
+        Of other values the first one that is set counts.
+        """
+        values = dict[str, Any]()
+        for entry in fields(self):
+            mine, theirs = getattr(self, entry.name), getattr(other, entry.name)
+            if isinstance(mine, Mapping):
+                values[entry.name] = {**mine, **theirs}
+            elif isinstance(mine, tuple):
+                values[entry.name] = (*mine, *theirs)
+            else:
+                values[entry.name] = mine or theirs
+        return Loads(**values)
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

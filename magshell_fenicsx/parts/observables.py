@@ -1,5 +1,5 @@
-"""Observables: what parts observe of a state, as columns of path.csv, maps and lines of
-summary.json; and the units of what is conjugate to amplitudes.
+"""Observables: what parts observe of a state, as columns of path.csv; and the units of what is
+conjugate to amplitudes.
 
 An amplitude mu is a load parameter, by name; its conjugate -dPi/dmu is the displacement on which it
 does work. Pi is the energy, and Pi_i the potential of amplitude i, its derivative. R is the
@@ -7,14 +7,16 @@ reference length, E Young's modulus, h the thickness over R. A column is a name 
 path.csv.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
 from magshell_fenicsx.quantities.registry import register_for_all_cases
 
@@ -47,6 +49,8 @@ class ModelView:
         Whether reactions of all supports are reported.
     sense
         Sign of the case's field.
+    points
+        Names of the points of the case.
     """
 
     model: "ObservedModel"
@@ -56,6 +60,7 @@ class ModelView:
     azimuth: float
     reactions: bool
     sense: float = 1.0
+    points: Sequence[str] = ()
 
     @property
     def loads(self) -> "Loads":
@@ -75,6 +80,20 @@ class ModelView:
     def potential(self, state: "State", name: str) -> float:
         """Return Pi_i(u) of the amplitude `name` of the modelled part of the shell."""
         return self.model.system.potential(state.u, state.mu, name)
+
+    def energies(self, state: "State") -> dict[str, float]:
+        """Return group of terms -> energy over E h R² of the whole shell; collective.
+
+        All terms of one field are one group. A term that an amplitude multiplies has this factor.
+        """
+        from magshell_fenicsx.assembly.terms import factor_of  # the solver takes long to import
+
+        by_group = defaultdict[str, float](float)
+        potentials = self.model.system.energies(state.u, state.mu)
+        for term in self.model.system.terms:
+            factor = self.model.multiplicity * factor_of(term.amplitude, state.mu)
+            by_group[term.group] += factor * potentials[term.name]
+        return by_group
 
 
 @dataclass(frozen=True)
@@ -151,24 +170,29 @@ class Observables:
         The part's columns, where they are not those of every run; see `Quantity.each`.
     curve_amplitudes
         The part's amplitudes with a curve of their own.
-    before_points
-        Whether the part's columns come before those of named points.
+    column_rank
+        Where the part's columns are in path.csv: 0 before those of named points, 1 right after
+        those of free amplitudes, 2 behind.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     curve_amplitudes: ClassVar[tuple[Amplitude, ...]] = ()
-    before_points: ClassVar[bool] = False
+    column_rank: ClassVar[int] = 2
 
     def __init_subclass__(cls) -> None:
         register_for_all_cases(cls.quantities, cls.curve_amplitudes)
+
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on the part, or on its absence."""
+        return Account()
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
         """Return the part's amplitudes that are columns of path.csv."""
         return ()
 
-    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
-        """Return further amplitudes of the part, which are columns and begin at zero."""
-        return ()
+    def free_amplitudes(self, loads: "Loads") -> Mapping[str, float]:
+        """Return further amplitudes of the part, which are columns -> where they begin."""
+        return {}
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         """Check that the surface has the patches that the part names.
@@ -190,10 +214,6 @@ class Observables:
         """
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
-    def moments(self, loads: "Loads") -> Sequence[str]:
-        """Return the columns that are moments, while others of the same kind are forces."""
-        return ()
-
     def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
         """Return the amplitudes that are motions, each with its way at an amplitude of one.
 
@@ -206,35 +226,8 @@ class Observables:
         return {}
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        """Return column -> value of the part at a state."""
-        return {}
-
-    def grids(self, loads: "Loads") -> Sequence[str]:
-        """Return the names of the grids in space on which the part observes a field."""
-        return ()
-
-    def on_grids(self, view: ModelView, state: "State") -> Sequence[MapGrid]:
-        """Return the grids of the part with the fields at a state; collective."""
-        return ()
-
-    def differentiable(self, loads: "Loads") -> Sequence[str]:
-        """Return the part's columns that have a `slope`."""
-        return ()
-
-    def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
-        """Return a column at a state with its derivatives; collective.
-
-        None if the column belongs to another part.
-        """
-        return None
-
-    def left_out(self, view: ModelView) -> Sequence[str]:
-        """Return phrases about the physics of the part that the model lacks."""
-        return ()
-
-    def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
-        """Return the part's entries of summary.json about the end of a path; collective."""
-        return {}
+        """Return column -> value of the part at a state; by default its free amplitudes."""
+        return {name: state.mu[name] for name in self.free_amplitudes(view.loads)}
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """Return -dPi/dmu of one unit of the conjugate of the amplitude `name`.

@@ -8,7 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 if TYPE_CHECKING:
+    import numpy as np
     from dolfinx import fem
+    from numpy.typing import NDArray
 
     from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
     from magshell_fenicsx.continuation.system import State, Vector
@@ -94,6 +96,15 @@ class ObservedModel(Protocol):
 
         `approach` is the amplitude of the body's approach, the key of `contacts`.
         """
+
+    def deflection(self, u: "Vector", point: str) -> float:
+        """Return w/R = -u . n0 at a named vertex; collective."""
+
+    def displacement(self, u: "Vector", point: str) -> "NDArray[np.float64]":
+        """Return u/R (3,) at a named vertex; collective."""
+
+    def volume_change(self, u: "Vector", mu: Mapping[str, float]) -> float:
+        """Return Delta V/R^3 of the whole shell with supports moved by amplitudes; collective."""
 
     def loaded_deflection(self, u: "Vector", name: str) -> float:
         """Return the w/R on which a force or the dead loads of an amplitude work; collective."""

@@ -27,6 +27,7 @@ from magshell_fenicsx.parts.step_course import (
     Prescribed,
     SnapSection,
     StepCourse,
+    StepEnd,
     StepStart,
     Target,
     Until,
@@ -42,14 +43,15 @@ class PathStep(Step):
 
     Attributes
     ----------
-    targets
-        The keys of targets.
-    conjugate_control
-        Name of the control that prescribes the conjugate displacement.
+    load_control, conjugate_control
+        Names of the controls that prescribe the amplitude, and the conjugate displacement.
+    divides_whole_way
+        Whether the equal parts of the first way to a target begin at zero, not where the step does.
     """
 
-    targets: ClassVar[dict[str, Target]] = {}
+    load_control: ClassVar[str] = "load"
     conjugate_control: ClassVar[str] = "displacement"
+    divides_whole_way: ClassVar[bool] = True
     control: str
     until: Until
     points: Count = 10
@@ -100,7 +102,7 @@ class PathStep(Step):
         # keys of targets that the control reaches: arc length those of the load and of the
         # conjugate, other controls those of the quantity that they prescribe
         fitting = [
-            key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)
+            key for key, target in self.targets.items() if prescribed in ("arc", target.quantity)
         ]
         for key, value in targets.items():
             if 0 < abs(value) < LEAST_TARGET:
@@ -174,31 +176,35 @@ class PathStep(Step):
             )
 
     @classmethod
-    def level(cls, text: str, context: Context) -> float:
+    def history_value(cls, text: str, context: Context) -> float:
         """Return a value of a history with a unit, converted as a target of the load."""
         # the type of the key of a load's target says how text with a unit is converted
         for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
             annotation = cls.model_fields[key].annotation
             if is_over_unit(annotation):
                 return over_unit(annotation, text, context.shell)
-        return super().level(text, context)
+        return super().history_value(text, context)
 
     @property
-    def ends(self) -> Until:
-        return self.until
-
-    @property
-    def released_by(self) -> SnapSection | None:
-        return self.snap if self.then == "snap" else None
-
-    @property
-    def follows_branch(self) -> bool:
-        return self.then == "follow"
+    def end(self) -> StepEnd:
+        return StepEnd(
+            until=self.until,
+            target=self._target,
+            bound=self._bound,
+            controls_conjugate=self.control == self.conjugate_control,
+            snap=self.snap if self.then == "snap" else None,
+            follows_branch=self.then == "follow",
+            branch_points=self.points if self.branches else 0,
+            sensitivities=self.sensitivities,
+        )
 
     @property
     def _given_targets(self) -> dict[str, float]:
-        """Mapping: key of each target that the case gives -> its value, in the unit of the key."""
-        return {key: value for key in self.targets if (value := getattr(self, key)) is not None}
+        """Mapping: key of each target that the case gives -> its value, or the square of that."""
+        given = {key: value for key in self.targets if (value := getattr(self, key)) is not None}
+        return {
+            key: value**2 if self.targets[key].squared else value for key, value in given.items()
+        }
 
     @property
     def _end(self) -> float | None:
@@ -210,15 +216,15 @@ class PathStep(Step):
         """The quantity that the solver prescribes step by step: load, conjugate or arc length."""
         if self.control == self.conjugate_control:
             return "conjugate"
-        return "load" if self.control == "load" else "arc"
+        return "load" if self.control == self.load_control else "arc"
 
     @property
-    def target(self) -> tuple[Target, float] | None:
+    def _target(self) -> tuple[Target, float] | None:
         """The target at which the path ends, and its value in the unit of its key; None without.
 
-        A target beside `until: limit` does not count here: it is a bound, the `limit_target`.
+        A target beside `until: limit` does not count here: it is a bound.
         """
-        if self.limit_target:
+        if self._bound:
             return None
         for key, value in self._given_targets.items():
             return self.targets[key], value
@@ -227,7 +233,7 @@ class PathStep(Step):
         return next(iter(self.targets.values())), self._end
 
     @property
-    def limit_target(self) -> tuple[Target, float] | None:
+    def _bound(self) -> tuple[Target, float] | None:
         """The latest end of the path with `until: limit`, and its direction; None without."""
         if self.until != "limit":
             return None
@@ -268,7 +274,7 @@ class PathStep(Step):
         """
         # the end of the path: a target or bound, with its value in the unit of its key; it is of
         # the load (`by_load`), the amplitude, or of its conjugate
-        goal = self.target or self.limit_target
+        goal = self._target or self._bound
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
         begin_value = load_start.value if by_load else load_start.conjugate
@@ -276,9 +282,10 @@ class PathStep(Step):
         change = load_start.size if end is None else end - begin_value
         # values at which the path must have a point: ahead of the begin, in the direction of change
         targets: list[float] = []
-        goes_to_end = self.until == "target" or self.limit_target is not None
+        goes_to_end = self.until == "target" or self._bound is not None
         if end is not None and goes_to_end:
-            begin = begin_value if load_start.is_driven else self.begin(begin_value)
+            divides_whole_way = self.divides_whole_way and not load_start.is_driven
+            begin = 0.0 if divides_whole_way else begin_value
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":  # back to the load zero, past the largest load
@@ -300,34 +307,7 @@ class PathStep(Step):
         """Return how the step follows its path from the state where it begins."""
         until = "target" if self.until == "zero" else self.until
         steps = self.points if until == "points" else None
-        return StepCourse(
-            self.drive(self.load_start(step_start)), until, steps, self.curves(step_start)
-        )
-
-    def load_start(self, step_start: StepStart) -> LoadStart:
-        """Return the value and the conjugate of the step's amplitude where the step begins."""
-        return step_start.load_start()
-
-    @property
-    def branch_points(self) -> int:
-        return self.points if self.branches else 0
-
-    @property
-    def wants_sensitivities(self) -> bool:
-        return self.sensitivities
-
-    def by_conjugate(self, *, at_target: bool) -> bool:
-        goal = self.target if at_target and self.until == "target" else None
-        if goal is not None and goal[0].quantity == "conjugate":
-            return True
-        return self.control == self.conjugate_control
-
-    def begin(self, step_start: float) -> float:
-        """Return where the equal parts of the first way to a target begin, by default at zero.
-
-        `step_start` is the value of the quantity with the target where the step begins.
-        """
-        return 0.0
+        return StepCourse(self.drive(step_start.load_start()), until, steps)
 
     def scale(self, load_start: LoadStart) -> float:
         """Return a value of the amplitude that counts as of order one in the arc length."""
@@ -350,10 +330,10 @@ class BodyForceStep(LoadStep):
     """The base of forces by the shell's own mass, in E/R: those of the order of h² bend it."""
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
-        return change / self.points if self.target or self.limit_target else load_start.h**2
+        return change / self.points if self.end.goal else load_start.h**2
 
     def scale(self, load_start: LoadStart) -> float:
-        goal = self.target or self.limit_target
+        goal = self.end.goal
         return abs(goal[1]) or load_start.h**2 if goal else load_start.h**2
 
 
@@ -386,34 +366,30 @@ class FactorStep(LoadStep):
         raise NotImplementedError
 
     @classmethod
-    def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+    def steps_before_load(cls, context: Context) -> list[tuple[str, Step]]:
         """Return the step that lets the factor grow to 1 before the only load of a case.
 
-        Empty if the load drives the factor itself, or the case does not ask for it.
+        Empty if the case does not ask for it.
         """
-        is_driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
-        if is_driven or not cls.asked_for(context):
+        if not cls.asked_for(context):
             return []
         (kind,) = get_args(cls.model_fields["kind"].annotation)  # the one word of its Literal
         step = cls.model_validate({"kind": kind})
         step._alone = True
         return [(cls.section, step)]
 
-    def drive(self, load_start: LoadStart) -> Drive:
-        """Return how the factor grows.
-
-        Before the load it grows by arc length, with a first step of half the way.
-        """
-        if not self._alone:
-            return super().drive(load_start)
-        size = load_start.size  # the amplitude at a factor of one
-        return Drive("arc", "load", end=size, targets=[size], first=size / 2, scale=size)
-
     def course(self, step_start: StepStart) -> StepCourse:
-        """Return the course of the step; before the load, it forbids an instability on the way."""
+        """Return the course of the step.
+
+        Before the load the factor grows by arc length, with a first step of half the way, and there
+        must be no instability on the way.
+        """
         course = super().course(step_start)
         if not self._alone:
             return course
+        size = step_start.size  # the amplitude at a factor of one
+        drive = Drive("arc", "load", end=size, targets=[size], first=size / 2, scale=size)
+        course = replace(course, drive=drive)
 
         def forbidden(mu: Mapping[str, float], what: str) -> str:
             """Return the message about an instability, at amplitudes `mu`, with its name."""

@@ -25,7 +25,7 @@ from magshell_fenicsx.input.section import (
     or_number,
 )
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
+from magshell_fenicsx.parts.kinds import DimpleSection, ShellKeys
 
 if TYPE_CHECKING:
     from magshell_fenicsx.mesh.surfaces_of_revolution import Profile
@@ -216,7 +216,7 @@ class CapSurface(RoundSection):
     """Angle of the rim from e3 [degree]"""
     hole: float | None = Field(default=None, ge=0.1)
     """Angle of the hole's edge from e3 [degree]"""
-    defect: Dimple | None = None
+    defect: DimpleSection | None = None
     """One dimple; for more see imperfections"""
 
     @model_validator(mode="after")
@@ -402,7 +402,7 @@ class RevolutionSurface(SurfaceSection):
     profile: ProfileSection
     """The curve; its largest r is the reference length R"""
     azimuth: Azimuth = None
-    defect: Dimple | None = None
+    defect: DimpleSection | None = None
     """One dimple; for more see imperfections"""
 
     @property

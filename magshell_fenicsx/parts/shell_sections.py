@@ -30,7 +30,7 @@ from magshell_fenicsx.input.section import (
     with_unit,
 )
 from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
-from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
+from magshell_fenicsx.parts.kinds import DimpleSection, ShellKeys
 from magshell_fenicsx.parts.revolution_sections import (
     AnnulusSurface,
     CapSurface,
@@ -139,7 +139,7 @@ class OneShape(Section):
     """Density ρ; with it frequencies are in hertz"""
     thickness_factor: Formula | None = None
     """Multiplies h: a formula of x, y, z over R"""
-    defect: Dimple | None = None
+    defect: DimpleSection | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
     width: (
         Annotated[

@@ -15,7 +15,6 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.quantities.quantity import NEEDS_DENSITY, Quantity, Unit
 
@@ -45,7 +44,7 @@ class SpinStep(BodyForceStep):
     """
 
     amplitude: ClassVar[str] = "spin"
-    targets: ClassVar[dict[str, Target]] = {"speed": Target("load", "spin")}
+    targets: ClassVar[dict[str, Target]] = {"speed": Target("load", "spin", squared=True)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             "spin",
@@ -63,23 +62,12 @@ class SpinStep(BodyForceStep):
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density
     [√(E/ρ)/R]"""
 
-    @property
-    def _given_targets(self) -> dict[str, float]:
-        return {} if self.speed is None else {"speed": self.speed**2}
+    def terms(self, context: Context) -> list[OwnTerm]:
+        return [OwnTerm(context.step.name, energy, of_volume=True)]
 
-    def of_history(self, value: float) -> float:
-        return value**2
-
-    def in_history(self, amplitude: float) -> float:
-        return sqrt(max(amplitude, 0.0))
-
-    def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        return [OwnTerm(step.name, energy, of_volume=True)]
-
-    def account(self, step: ProgrammeStep, context: Context) -> str:
-        return (
-            f"centrifugal forces of a shell that spins about e3, amplitude {step.name} = ρ ω² R²/E"
-        )
+    def account(self, context: Context) -> str:
+        words = "centrifugal forces of a shell that spins about e3, amplitude"
+        return f"{words} {context.step.name} = ρ ω² R²/E"
 
 
 def energy(r0: Jet, u: Jet) -> "Expr":

@@ -8,6 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, Self, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.input.section import Pressure, Section, over_size
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.step import Step
 
+Array = NDArray[np.float64]
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
     Field(
@@ -32,6 +35,8 @@ Until = Annotated[
 ]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
+# the chart of a place, by the azimuth of the model's frame (rad) and whether half is modelled
+ChartOfPlace = Callable[[float, bool], Array]
 # other amplitudes as functions of the one that a step drives: value and two derivatives
 Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]
 
@@ -109,10 +114,69 @@ class SnapSection(Section):
 
 
 class Target(NamedTuple):
-    """A quantity that the value of a key prescribes, and its column of path.csv."""
+    """A quantity that the value of a key prescribes, and its column of path.csv.
+
+    Attributes
+    ----------
+    quantity
+        The quantity: the amplitude, or its conjugate.
+    column
+        Its column.
+    squared
+        Whether the quantity is the square of the key's value.
+    """
 
     quantity: Prescribed
     column: str
+    squared: bool = False
+
+
+@dataclass(frozen=True)
+class StepEnd:
+    """Where a step ends, and what follows there.
+
+    Attributes
+    ----------
+    until
+        The event at which the step ends, in the words of a path's `until`.
+    target
+        The target and its value, in the unit of its key; None without.
+    bound
+        The latest end of a path to the first instability, as `target` is given; None without.
+    controls_conjugate
+        Whether the conjugate is prescribed from point to point.
+    at_rest
+        Whether the step ends in equilibrium.
+    snap
+        How the shell is released at the end; None if it is not.
+    follows_branch
+        Whether the path goes on along the branch at the bifurcation that ends the step.
+    branch_points
+        Number of steps in each direction of a branch; 0 if no branch is followed.
+    sensitivities
+        Whether derivatives of the load at the fold by numbers of the case are requested.
+    """
+
+    until: Until = "target"
+    target: tuple[Target, float] | None = None
+    bound: tuple[Target, float] | None = None
+    controls_conjugate: bool = False
+    at_rest: bool = True
+    snap: SnapSection | None = None
+    follows_branch: bool = False
+    branch_points: int = 0
+    sensitivities: bool = False
+
+    @property
+    def goal(self) -> tuple[Target, float] | None:
+        """The target, or else the latest end of a path to the first instability."""
+        return self.target or self.bound
+
+    def by_conjugate(self, *, at_target: bool) -> bool:
+        """Return whether the conjugate is prescribed at the step's points, or at its target."""
+        target = self.target if at_target and self.until == "target" else None
+        has_conjugate_target = target is not None and target[0].quantity == "conjugate"
+        return has_conjugate_target or self.controls_conjugate
 
 
 @dataclass(frozen=True)
@@ -184,12 +248,15 @@ class ProgrammeStep:
         Place of the step in the case file, as a key.
     load
         Section of the step.
+    drives
+        Amplitudes of other steps that it drives too.
     """
 
     number: int
     name: str
     key: str
     load: "Step"
+    drives: tuple[str, ...] = ()
 
     @property
     def kind(self) -> str:
@@ -199,7 +266,7 @@ class ProgrammeStep:
     @property
     def until(self) -> Until:
         """The event at which the step ends."""
-        return self.load.ends
+        return self.load.end.until
 
 
 @dataclass(frozen=True)
@@ -226,6 +293,8 @@ class StepStart:
         Amplitude -> -dPi/dmu of one unit of the key that prescribes it.
     open
         Whether a live pressure has no potential.
+    size
+        The amplitude at a target of one unit of the target's key.
     """
 
     step: ProgrammeStep
@@ -237,6 +306,7 @@ class StepStart:
     potential: Callable[[str], float]
     unit: Callable[[str], float]
     open: bool
+    size: float = 1.0
 
     @property
     def is_driven(self) -> bool:
@@ -249,13 +319,12 @@ class StepStart:
     def load_start(self) -> LoadStart:
         """Return the value and the conjugate of the step's amplitude at the begin of the step."""
         name = self.step.name
-        size = self.step.load.size(self.context)
         return LoadStart(
             value=self.mu[name],
             conjugate=-self.potential(name),
             unit=self.unit(name),
             is_driven=self.is_driven,
-            size=size,
+            size=self.size,
             h=self.h,
         )
 
@@ -338,3 +407,22 @@ class SizingContext:
     refinement: float
     solid: bool
     local: bool
+
+
+@dataclass(frozen=True)
+class MeshHints:
+    """The element sizes that suit a load.
+
+    Attributes
+    ----------
+    growth
+        How fast elements may grow away from small ones: size per distance.
+    rim
+        Size of elements along the edge of a curved surface, over sqrt(Rh).
+    largest
+        Largest element size on a curved disc, over R; None for the usual one.
+    """
+
+    growth: float = 0.4
+    rim: float = 1.4
+    largest: float | None = None

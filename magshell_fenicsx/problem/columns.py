@@ -15,7 +15,10 @@ from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.supports.reacting import moment_columns
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import DISTANCE, TURN, Unit
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
@@ -27,8 +30,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
     Prescribed motions have sizes of their own: the way in mm, or the angle in degrees, at a factor
     1.
     """
-    moments = {column for registered in OBSERVABLES for column in registered.moments(problem.loads)}
-    sizes = sizes_of(problem.context, moments)
+    sizes = sizes_of(problem.context, moment_columns(problem.loads))
     # nan: the case has no unit of length
     if sizes.case is None or isnan(sizes.case.R):
         return sizes
@@ -47,15 +49,10 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
 
     They are those of parts, of user-defined energies, and of the parameters of these.
     """
-    amplitudes_of_parts = {
-        name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)
-    }
-    terms = [term for term in loads.user_terms if term.density]
-    return (
-        amplitudes_of_parts
-        | {term.name: term.value for term in terms}
-        | {p.name: p.value for term in terms for p in term.free_parameters}
-    )
+    amplitudes = dict[str, float]()
+    for registered in OBSERVABLES:
+        amplitudes |= registered.free_amplitudes(loads)
+    return amplitudes
 
 
 def extra_columns(problem: Problem) -> tuple[str, ...]:
@@ -66,23 +63,23 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     """
     loads = problem.loads
     columns_of_points = [f"{point}_u{axis}" for point in problem.context.points for axis in "xyz"]
-    observed = [column for term in loads.user_terms for column in term.observed]
     reported_supports = problem.supports if problem.reactions else ()
-    before_points, after_points = list[str](), list[str]()
+    columns_of_rank: tuple[list[str], ...] = ([], [], [])
     for registered in OBSERVABLES:
-        # one of both lists, which grows in place
-        columns = before_points if registered.before_points else after_points
-        columns += registered.columns(loads, reported_supports)
+        columns_of_rank[registered.column_rank].extend(registered.columns(loads, reported_supports))
     # a shell that is released at the end of a step moves in time too
-    is_in_time = any(step.load.in_time or step.load.released_by for step in problem.programme)
+    is_in_time = any(
+        isinstance(step.load, TimeSection) or step.load.end.snap for step in problem.programme
+    )
     columns_in_time = [q.name for q in IN_TIME] if is_in_time else []
     amplitudes = own_amplitudes(loads)
+    before_points, integrals, behind = columns_of_rank
     own_columns = (
         *before_points,
         *columns_of_points,
         *amplitudes,
-        *observed,
-        *after_points,
+        *integrals,
+        *behind,
         *columns_in_time,
     )
     standard_columns = [q.name for q in OF_EVERY_RUN]
@@ -133,8 +130,8 @@ def sizes_of(context: Context, moments: Collection[str] = ()) -> Sizes:
     """
     shell = context.shell
     units = case_sizes(shell)
-    for section in context.abilities:
-        units = section.units(context, units)
+    if magnetic := context.section_of(MagneticSection):
+        units = magnetic.with_field(context, units)
     if shell.with_units and context.time_unit is not None:  # times of motions are in seconds
         units = replace(units, second=1.0)
     return Sizes(units, moments)

@@ -126,10 +126,8 @@ def _specs(context: Context) -> Iterator[Formulas]:
     factor = context.shell.thickness_factor
     if isinstance(factor, str):
         yield Formulas(THICKNESS, [factor], MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR, 1.0)
-    for section in context.abilities:
-        yield from section.formulas(context)
-    for step in context.steps:
-        yield from step.load.formulas(step.key, context)
+    for contributor, view in context.contributors():
+        yield from contributor.formulas(view)
 
 
 def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:

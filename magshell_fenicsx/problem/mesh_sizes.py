@@ -22,7 +22,7 @@ from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFea
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import Step
-from magshell_fenicsx.parts.step_course import SizingContext
+from magshell_fenicsx.parts.step_course import MeshHints, SizingContext
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, edges_of_inflated_rubber
 
 if TYPE_CHECKING:
@@ -38,8 +38,7 @@ MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over
 RUBBER_EDGE_SIZE, RUBBER_EDGE_SIZE_AT_DEGREE_3 = 1.0, 2.8
 MIN_RUBBER_EDGE_SIZE = 0.014  # of these elements over R
 RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
-EDGE_SIZE, GRID_EDGE_SIZE = 1.4, 1.2  # over sqrt(Rh), along held edges of discs and grids
-GROWTH = 0.4  # of the size per distance
+GRID_EDGE_SIZE = 1.2  # over sqrt(Rh), along held edges of grids
 
 
 class MeshSection(Section):
@@ -184,13 +183,18 @@ def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -
     if not outline.disc or context.shell.geometry == "disc":  # a strip, or a flat disc
         width = getattr(context.shell, "width", None) or 1.0
         return min(MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH * width)
-    sizes = (step.load.largest(sizing) for step in context.steps)
+    sizes = (hints.largest for hints in _hints_of_loads(context, sizing))
     return min((size for size in sizes if size is not None), default=MAX_SIZE)
 
 
+def _hints_of_loads(context: Context, sizing: SizingContext) -> list[MeshHints]:
+    """Return the element sizes that suit each load; the usual ones for a case without a load."""
+    return [step.load.mesh_hints(sizing) for step in context.steps] or [MeshHints()]
+
+
 def _growth(context: Context, sizing: SizingContext) -> float:
-    """Return the largest growth of the element size per distance that all loads allow."""
-    return max((step.load.growth(sizing) for step in context.steps), default=GROWTH)
+    """Return the largest growth of the element size per distance that suits a load."""
+    return max(hints.growth for hints in _hints_of_loads(context, sizing))
 
 
 def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
@@ -221,6 +225,6 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
         return []
     features = [RingFeature(outline.edge, rubber_size, RUBBER_GROWTH)] if rubber_edges else []
     if context.shell.geometry != "disc":
-        size = max((step.load.rim(sizing) for step in context.steps), default=EDGE_SIZE)
+        size = max(hints.rim for hints in _hints_of_loads(context, sizing))
         features.append(RingFeature(outline.edge, size * sqrt(h) / sizing.refinement, growth))
     return features

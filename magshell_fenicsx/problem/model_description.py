@@ -15,7 +15,7 @@ from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.laws.law_section import LawSection, law_account
 from magshell_fenicsx.parts.laws.rubber_material import laws_of
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.registered import PART_CLASSES, accounts, parts_of
+from magshell_fenicsx.parts.registered import OBSERVABLES, PART_CLASSES
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import SolidBody, solid_body_of
 
@@ -40,23 +40,28 @@ def describe_model(
     body = solid_body_of(context)
     included = [model, _body_text(body, context.shell.law_section) if body else _law_text(context)]
     left_out = list[str]()
-    for part_account in accounts(context, loads):
+    for observables in OBSERVABLES:
+        part_account = observables.account(context, loads)
         included += part_account.included
         left_out += part_account.left_out
     if context.sections.get("imperfections"):
         included.append(_imperfections_text(context, rims))
     # each amplitude once, by its last step
-    for step in {step.name: step for step in context.steps}.values():
-        if text := step.load.account(step, context):
+    for step in context.last_steps.values():
+        if text := step.load.account(context.at_step(step)):
             included.append(text)
     # sections of the case that may be absent
-    parts = parts_of(context)
-    for key, part in PART_CLASSES.items():
-        if key in parts:
-            included.append(parts[key].account(context.scales))
-        else:
-            left_out.append(part.absent)
-    # what a reduced model leaves out
+    for key, part_class in PART_CLASSES.items():
+        if part := context.sections.get(key):
+            included.append(part.account(context))
+        elif part_class.absent:
+            left_out.append(part_class.absent)
+    return included, [*left_out, *_left_out_by_symmetry(loads, model, mirror)]
+
+
+def _left_out_by_symmetry(loads: Loads, model: str, mirror: Mirror | None) -> list[str]:
+    """Return phrases for what a meridian, a half or a sector leaves out."""
+    left_out = list[str]()
     if model == "meridian":
         contact_words = ""
         if loads.pairs:
@@ -77,7 +82,7 @@ def describe_model(
             f"the other half: mirror plane {plane} "
             "(modes antisymmetric to it are looked for along the path)"
         )
-    return included, left_out
+    return left_out
 
 
 def _imperfections_text(context: Context, rims: int) -> str:

@@ -40,6 +40,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSectio
 from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import edges_of_inflated_rubber
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
@@ -171,7 +172,7 @@ class PendingModes:
 
 def _needs_inertia_alone(step: ProgrammeStep) -> bool:
     """Return whether a step is a motion of a shell that may be free of supports."""
-    return step.load.motion is not None and step.load.motion.needs_inertia_alone
+    return isinstance(step.load, TimeSection) and step.load.needs_inertia_alone
 
 
 @dataclass(frozen=True)

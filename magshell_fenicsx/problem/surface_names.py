@@ -17,10 +17,10 @@ from magshell_fenicsx.models.shell.kinematics import SECOND_DERIVATIVES
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
-from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.ability import Ability, Context
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.pressure.openings import moving_edges, without_potential
-from magshell_fenicsx.parts.registered import OBSERVABLES, parts_of
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 from magshell_fenicsx.quantities.registry import RESERVED_NAMES
 
@@ -36,23 +36,29 @@ def surface_terms(context: Context, user_terms: Sequence[OwnTerm]) -> tuple[OwnT
     CaseError
         If a part's amplitude is out of bounds, a name is taken, or a solid cannot have a term.
     """
-    terms = []
-    for key, part in parts_of(context).items():
-        for term in part.terms(context.scales):
-            if term.density and not MIN_AMPLITUDE <= abs(term.value) <= MAX_AMPLITUDE:
-                raise CaseError(
-                    f"{key}: {term.name} is {term.value:.4g} E h/R²; "
-                    f"allowed are {MIN_AMPLITUDE:g} to {MAX_AMPLITUDE:g}"
-                )
-            terms.append(term)
+    terms = list[OwnTerm]()
     # several steps may drive one amplitude, which has its energy once
-    for step in {step.name: step for step in context.steps}.values():
-        terms += step.load.terms(step, context)
+    for contributor, view in context.contributors(last_steps=True):
+        contributed_terms = contributor.terms(view)
+        if view.current_step is None:  # the amplitude of a step is what the step makes of it
+            _refuse_unfit_amplitudes(context, contributor, contributed_terms)
+        terms += contributed_terms
     terms += user_terms
     _refuse_taken_names(terms)
     if context.solid:
         _refuse_unfit_for_solid(terms)
     return tuple(terms)
+
+
+def _refuse_unfit_amplitudes(context: Context, ability: Ability, terms: Sequence[OwnTerm]) -> None:
+    """Refuse amplitudes of an ability's energies that are out of bounds, by a CaseError."""
+    for term in terms:
+        if term.density and not MIN_AMPLITUDE <= abs(term.value) <= MAX_AMPLITUDE:
+            key = next(key for key, section in context.sections.items() if section is ability)
+            raise CaseError(
+                f"{key}: {term.name} is {term.value:.4g} E h/R²; "
+                f"allowed are {MIN_AMPLITUDE:g} to {MAX_AMPLITUDE:g}"
+            )
 
 
 def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:

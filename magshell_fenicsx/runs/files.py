@@ -61,7 +61,7 @@ from magshell_fenicsx.output.store.manifest import NAME as MANIFEST
 from magshell_fenicsx.output.store.run_identity import CHECKPOINT, NEW_CHECKPOINT, SUMMARY
 from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
-from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.magnetism.field_maps import maps_at
 from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -368,7 +368,7 @@ class RunFiles:
         outlines_file = ""
         if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
             outlines_file = FILE_OF_POINT if outlines_move else FILE_OF_ALL_POINTS
-        grids = [grid for observables in OBSERVABLES for grid in observables.grids(problem.loads)]
+        grids = [field_map.grid.name for field_map in problem.loads.field_maps]
         rows = self._table.complete_rows
         self._fields = FieldSeries(self._folder / "fields", shell_data, outlines_file, rows, grids)
         sync_folder(self._folder)
@@ -398,9 +398,7 @@ class RunFiles:
         if scene is not self._scene:  # the path goes on in another model
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
-        grids = [
-            grid for observables in OBSERVABLES for grid in observables.on_grids(scene.view, state)
-        ]
+        grids = maps_at(scene.view, state)
 
         def write() -> None:
             """Write the row, the grids and the fields of the whole or modelled shell; on rank 0."""

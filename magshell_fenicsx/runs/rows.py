@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.point import RecordedValues
 from magshell_fenicsx.continuation.transient import MIN_ENERGY_DISPLACEMENT
 from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
+from magshell_fenicsx.parts.step_course import SnapSection
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 if TYPE_CHECKING:
     import pandas
-
-    from magshell_fenicsx.parts.motion.motion_step import TimeSection
 
 SUMMED_COLUMNS = ("time", "dissipated", "work")
 
@@ -120,7 +120,7 @@ def imbalances(
     """
     for step in programme:
         # a static step has a limit too, as its snap may be a motion
-        max_imbalance = step.load.motion.balance if step.load.motion else BALANCE
+        max_imbalance = step.load.balance if isinstance(step.load, TimeSection) else BALANCE
         step_imbalances = [
             _imbalance(row, length)
             for row in rows
@@ -135,12 +135,12 @@ def imbalances(
             )
 
 
-def _chooses_step_length(motion: "TimeSection | None") -> bool:
+def _chooses_step_length(motion: TimeSection | SnapSection) -> bool:
     """Return whether a motion chooses the length of its steps itself.
 
-    One to an instability does not count, as it ends where states become unstable.
+    One to an instability does not count, as it ends where states become unstable; nor does a snap.
     """
-    if motion is None:
+    if isinstance(motion, SnapSection):
         return False
     return motion.step is None and motion.until != "instability"
 
@@ -155,7 +155,7 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
     """
     for step in programme:
         load = step.load
-        motion = load.motion or load.released_by
+        motion = load if isinstance(load, TimeSection) else load.end.snap
         rows = [
             row for row in all_rows if row["step"] == step.number and row["amplitude"] == "time"
         ]
@@ -167,7 +167,7 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
                 f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
-        estimates_own_steps = motion.errors == "step" and _chooses_step_length(load.motion)
+        estimates_own_steps = motion.errors == "step" and _chooses_step_length(motion)
         is_unstable = any(int(row["negative_pivots"]) for row in rows)
         if estimates_own_steps and is_unstable:
             yield (

@@ -570,7 +570,9 @@ def _mesh_for_tolerance(
         say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
         return None
     # on a branch, which may be in a larger model, the result has an error of its own
-    if not any(step.load.follows_branch or step.load.branch_points for step in problem.programme):
+    if not any(
+        step.load.end.follows_branch or step.load.end.branch_points for step in problem.programme
+    ):
         return mesh
     try:
         return replace(mesh, branch=branched(mesh, comm, say, report))
@@ -631,7 +633,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
     if last_row["label"] != "fold":
         return {}
     step = scene.problem.programme[int(last_row["step"]) - 1]  # steps are numbered from 1
-    if not step.load.wants_sensitivities:
+    if not step.load.end.sensitivities:
         return {}
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 

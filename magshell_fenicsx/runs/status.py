@@ -92,18 +92,17 @@ def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
     """
     problem, load, load_column = scene.problem, step.load, amplitude(step.name).column
     # an end of the step's own, in words
-    planned_end = load.expected_end(step, problem.context, problem.loads, problem.azimuth)
+    planned_end = load.expected_end(problem.context.at_step(step), problem.loads, problem.azimuth)
     if planned_end:
         return PathEnd(load_column, planned_end.end, planned_end.words, planned_end.steps)
     # a number of steps, or an event
     if step.until == "points":
         return PathEnd(load_column, words=f"{load.points} steps", steps=load.points)
-    if step.until != "target" or load.target is None:
+    if step.until != "target" or load.end.target is None:
         return PathEnd(load_column, words=EVENT_WORDS.get(step.until, ""))
-    # a target of the load; size: the amplitude at a target of one
-    target, value = load.target
+    target, value = load.end.target
     if target.quantity == "load":
-        return PathEnd(load_column, value * load.size(problem.context))
+        return PathEnd(load_column, value)
     # a target of the conjugate: in a column of a part
     for observables in OBSERVABLES:
         if column := observables.conjugates(problem.loads).get(step.name):
@@ -275,7 +274,7 @@ class RunProgress:
     @property
     def _branched(self) -> bool:
         """Whether the case requests branches; their number is not known in advance."""
-        return self._load is not None and self._load.branch_points > 0
+        return self._load is not None and self._load.end.branch_points > 0
 
     @property
     def _snaps(self) -> bool:

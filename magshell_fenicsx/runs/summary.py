@@ -23,7 +23,7 @@ from magshell_fenicsx.output.fields.mode_fields import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.run_identity import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
-from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.magnetism.readings import moment_in_summary
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import Sizes, amplitude
@@ -318,10 +318,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         snap_times = _in_milliseconds(snaps_of_run[0], scene.sizes)
     if result.adapted:
         tolerance = {"tolerance": result.adapted.account(result.value, result.branch_error)}
-    # what parts observe at the end, such as reactions
-    observed = dict[str, Any]()
-    for observables in OBSERVABLES:
-        observed |= observables.summary(result.scene_of(result.end).view, result.last)
+    # the magnetic moment at the end
+    observed = moment_in_summary(result.scene_of(result.end).view, result.last)
     excluded_pivots = (int(row["excluded_pivots"]) for row in result.rows)
     return {
         "case": requested_problem.document.data,

@@ -90,7 +90,7 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     """
     name, h = step.name, scene.problem.material.h
     # the target is a pair: what it prescribes, and the value
-    target = step.load.target or step.load.limit_target
+    target = step.load.end.goal
     end_of_approach = inf
     if target:
         prescribed, value = target

@@ -21,6 +21,7 @@ from magshell_fenicsx.continuation.continuation_run import ContinuationGoal
 from magshell_fenicsx.continuation.path import ZERO_DISPLACEMENT, NotANumber
 from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.contact_control import penetration_message
@@ -87,7 +88,7 @@ def follow(
         _refuse_not_numbers(scene, state, run.place)
         try:
             yield from run.path(state)
-            if step.load.limit_target and not run.is_unstable:
+            if step.load.end.bound and not run.is_unstable:
                 remark(
                     f"{run.place}there is no instability up to the target, where until: limit ends "
                     "too"
@@ -186,11 +187,11 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
         pivots = scene.newton.factor_at(state).negative_pivots
     clock = dict[str, float]()
     steps = scene.problem.programme
-    first_motion = steps[0].load.motion if steps else None
-    if first_motion and not has_rise:
+    first_load = steps[0].load if steps else None
+    if isinstance(first_load, TimeSection) and not has_rise:
         from magshell_fenicsx.simulate.transient import initial_clock
 
-        clock = initial_clock(scene, first_motion, state)
+        clock = initial_clock(scene, first_load, state)
     yield record(pivots, 1, clock)
     if pivots:
         reason = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
@@ -248,7 +249,7 @@ class _StepRun:
     @property
     def has_answer(self) -> bool:
         """Whether the step has found the instability that it looks for, whatever stops it later."""
-        is_to_limit = self._step.until == "limit" and not self._step.load.released_by
+        is_to_limit = self._step.until == "limit" and not self._step.load.end.snap
         return self._first_instability is not None and is_to_limit
 
     def reason(self, error: Exception) -> str:
@@ -285,7 +286,7 @@ class _StepRun:
         """
         fold = self._last
         # nothing is released
-        if not (self._step.load.released_by and fold):
+        if not (self._step.load.end.snap and fold):
             return ""
         # it is released in the larger model, which has the mode of the bifurcation
         if self._is_released_at_bifurcation:
@@ -308,7 +309,7 @@ class _StepRun:
         if record is None:
             return
         records: Records | None = None
-        if step.load.released_by:
+        if snap := step.load.end.snap:
             # the snap starts in the larger model; its first record is still on the path (branch 0)
             if self._is_released_at_bifurcation:
                 record = symmetry_switch_of_step(self.scene, step, record).record(number=0)
@@ -317,8 +318,8 @@ class _StepRun:
             from magshell_fenicsx.simulate.transient import snap_records
 
             held_conjugates = held_conjugates_of_step(self.scene, step, record.point.state)
-            records = snap_records(self.scene, step.load.released_by, record, held_conjugates)
-        elif step.load.follows_branch and self.label == "bifurcation":
+            records = snap_records(self.scene, snap, record, held_conjugates)
+        elif step.load.end.follows_branch and self.label == "bifurcation":
             records = follow_branch_of_step(self.scene, step, record)
         if records is None:
             return

@@ -322,7 +322,7 @@ def target_ratios(
     for step, new_step in zip(
         old.problem.programme[:steps], new.problem.programme[:steps], strict=True
     ):
-        old_target, new_target = step.load.target, new_step.load.target
+        old_target, new_target = step.load.end.target, new_step.load.end.target
         if not (old_target and new_target):
             continue
         if old_target[0].quantity != quantity:

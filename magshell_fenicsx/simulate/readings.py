@@ -34,6 +34,7 @@ from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, System, max_abs
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
@@ -147,11 +148,11 @@ class PrescribedQuantity:
     def __init__(self, scene: Scene) -> None:
         """Find the quantity by the last step, with its columns and the size of its unit."""
         programme = scene.problem.programme  # the list of steps; a motion prescribes no load
-        if not programme or programme[-1].load.motion:
+        if not programme or isinstance(programme[-1].load, TimeSection):
             raise CaseError("the case has no last step that prescribes a load or a displacement")
         self.scene, self.step = scene, programme[-1]
         self.name = self.step.name
-        self.by_conjugate = self.step.load.by_conjugate(at_target=True)
+        self.by_conjugate = self.step.load.end.by_conjugate(at_target=True)
         self._unit, self.dimensionless_column = 1.0, amplitude(self.name).column
         if self.by_conjugate:
             columns = {name: (column, unit) for column, (name, unit) in conjugates(scene).items()}
@@ -246,7 +247,7 @@ class PrescribedQuantity:
         if self.name.startswith("lambda_") and problem.lambda_m:
             return other.lambda_m / problem.lambda_m
         # a target is a pair of what it prescribes and its value
-        old_target, new_target = self.step.load.target, other.programme[-1].load.target
+        old_target, new_target = self.step.load.end.target, other.programme[-1].load.end.target
         quantity = "conjugate" if self.by_conjugate else "load"
         if not (old_target and new_target):
             return 1.0

@@ -31,6 +31,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField
+from magshell_fenicsx.parts.magnetism.readings import slope_of_sensor
 from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -122,10 +123,9 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
     if result in (reactions := _reactions(scene)):
         support, axis = reactions[result]
         return _reaction(scene, state, support, axis, result)
-    # a column of a part, as of a sensor
-    for part_observables in OBSERVABLES:
-        if slope := part_observables.slope(scene.view, state, result):
-            return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
+    # a column of a sensor
+    if slope := slope_of_sensor(scene.view, state, result):
+        return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
     # an amplitude, by its name or its column
     name = next((name for name in state.mu if result in (name, amplitude(name).column)), "")
     if name:
@@ -149,11 +149,7 @@ def _deflection_of_pole(scene: Scene, state: State) -> Functional:
 def differentiable(scene: Scene, state: State) -> list[str]:
     """Return the columns of path.csv that `functional` takes, also those in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
-    part_columns = (
-        column
-        for observables in OBSERVABLES
-        for column in observables.differentiable(scene.problem.loads)
-    )
+    part_columns = (column for sensor in scene.problem.loads.sensors for column in sensor.columns)
     amplitudes = (
         amplitude(name).column for name in state.mu if name not in scene.model.system.history
     )

@@ -17,11 +17,10 @@ Words and symbols:
 """
 
 import time
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from math import copysign, nan
+from math import copysign
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -30,7 +29,6 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import NoJournal, NoProgress, Progress, SolverJournal
 from magshell_fenicsx.continuation.snes import NewtonOptions
@@ -39,7 +37,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.mirror import Y0_PLANE, rotation
+from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
@@ -47,6 +45,7 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.observables import ModelView
+from magshell_fenicsx.parts.pressure.openings import no_potential
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.supports.motion import UNHELD_CONDITIONS
 from magshell_fenicsx.platform.compiler import check_compiler
@@ -375,8 +374,8 @@ class Scene:
     @property
     def left_out(self) -> list[str]:
         """Phrases for the physics that the model leaves out."""
-        lacks_of_parts = (observables.left_out(self.view) for observables in OBSERVABLES)
-        return [*self.problem.left_out, *(phrase for lacks in lacks_of_parts for phrase in lacks)]
+        open_at = self.model.without_potential if self.problem.loads.pressure else ()
+        return [*self.problem.left_out, *([no_potential(open_at)] if open_at else [])]
 
     def unloaded(self) -> State:
         """Return the state of the undeformed shell, without loads.
@@ -481,64 +480,14 @@ class Scene:
         over E h R^2. A column without a value is NaN.
         """
         self.refuse_foreign(state, allows_more=True)
-        model, h, loads = self.model, self.problem.material.h, self.model.loads
-        force = loads.forces.get("force")
-        energies = self.energies(state)  # by group of terms
-        # deflections over h: of the pole, and that on which the load does work
-        pole = model.deflection(state.u, "pole") / h
-        deflection = pole
-        if loads.displaced:  # the name of the load whose displacement w is reported
-            deflection = model.loaded_deflection(state.u, loads.displaced) / h
-        # a column of an energy is the sum of its groups
-        energy_of_column = defaultdict[str, float](float)
-        for group, column in {term.group: term.column for term in model.system.terms}.items():
-            energy_of_column[column] += energies[group]
-        is_split = "stretching" in energy_of_column  # the energy of a solid is not
-        columns = {
-            "p_over_pc": state.mu.get("pressure", 0.0),
-            "force": 0.0,
-            "w_over_h": deflection,
-            "w_pole_over_h": pole,
-            "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
-            "volume_change": model.volume_change(state.u, state.mu),
-            "energy": sum(energies.values()),
-            "stretching": energy_of_column["stretching"] if is_split else nan,
-            "bending": energy_of_column["bending"] if is_split else nan,
-            "magnetic": energy_of_column["magnetic"],
-            **{name: energies[name] for name in ("U1", "Uq", "Utau")},
-            **self._observe_points(state),
-            **{name: state.mu[name] for name in self._own_amplitudes},
-        }
-        view = self.view
+        view, columns = self.view, dict[str, float]()
         for observables in OBSERVABLES:
             columns |= observables.observe(view, state)
-        return columns | self._observe_own_terms(state)
-
-    def _observe_own_terms(self, state: State) -> dict[str, float]:
-        """Return column -> integral over the shell that an own energy observes; collective.
-
-        Each own energy of a program may have such integrals beside its density.
-        """
-        model, columns = self.model, dict[str, float]()
-        for term in self.problem.loads.user_terms:
-            # a term without a density has no energy, and so no amplitude
-            factor = state.mu[term.name] if term.density else 1.0
-            for column in term.observed:
-                integral = model.system.at_state(state).integral(model.observed[column])
-                columns[column] = factor * model.multiplicity * integral
         return columns
 
     def energies(self, state: State) -> dict[str, float]:
-        """Return group of terms -> energy over E h R^2 of the whole shell; collective.
-
-        All terms of one field are one group. A term that an amplitude multiplies has this factor.
-        """
-        model, by_group = self.model, defaultdict[str, float](float)
-        potentials = model.system.energies(state.u, state.mu)
-        for term in model.system.terms:
-            factor = factor_of(term.amplitude, state.mu)
-            by_group[term.group] += model.multiplicity * factor * potentials[term.name]
-        return by_group
+        """Return group of terms -> energy over E h R^2 of the whole shell; collective."""
+        return self.view.energies(state)
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
@@ -589,9 +538,15 @@ class Scene:
         """The model with the units and the frame of reports, for observables of parts."""
         problem = self.problem
         sense = copysign(1.0, problem.lambda_m)  # of the magnetic field
-        place = problem.mirror, problem.azimuth  # which part is modelled, and in which frame
         return ModelView(
-            self.model, problem.length, problem.modulus, *place, problem.reactions, sense
+            self.model,
+            problem.length,
+            problem.modulus,
+            problem.mirror,
+            problem.azimuth,
+            problem.reactions,
+            sense,
+            tuple(problem.context.points),
         )
 
     def to_magpylib(self, record: Record, parts: int = 8) -> Any:
@@ -617,18 +572,6 @@ class Scene:
         """
         units = (observables.conjugate_unit(self.view, name) for observables in OBSERVABLES)
         return next((unit for unit in units if unit is not None), 0.0)
-
-    def _observe_points(self, state: State) -> dict[str, float]:
-        """Return column -> component of a named point's displacement, in the case's length unit."""
-        displacements: dict[str, float] = {}
-        for point in self.problem.context.points:
-            u = self.problem.length * self.model.displacement(state.u, point)
-            u = u @ rotation(self.problem.azimuth)  # from the model's frame to the case's
-            displacements |= {
-                f"{point}_u{axis}": float(component)
-                for axis, component in zip("xyz", u, strict=True)
-            }
-        return displacements
 
 
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:

@@ -318,7 +318,7 @@ class SceneFamily:
             )
         for earlier in earlier_steps:
             # a target is a pair of what it prescribes and its value
-            target = earlier.load.target or earlier.load.limit_target
+            target = earlier.load.end.goal
             ends_at_conjugate = target and target[0].quantity == "conjugate"
             if earlier.load.hold or ends_at_conjugate:
                 raise CaseError(
@@ -587,9 +587,7 @@ class SceneFamily:
         # at the target of an earlier step; a target is a pair of what it prescribes and its value
         earlier_steps = old.programme[: self._record.step - 1]
         for old_step, new_step in zip(earlier_steps, new.programme, strict=False):
-            old_target, new_target = (
-                step.load.target or step.load.limit_target for step in (old_step, new_step)
-            )
+            old_target, new_target = (step.load.end.goal for step in (old_step, new_step))
             if not (old_target and new_target):
                 continue
             if old_target[0].quantity != "load":

@@ -25,6 +25,7 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.bodies.contact_step import contact_step_options as along_contact
+from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.pressure.pressure import EnclosedGas
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Drive, Gas, GasSection, StepCourse, StepStart
@@ -66,11 +67,11 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         If the path is lost, or the shell becomes unstable where it must not.
     """
     load = step.load
-    if load.motion:
+    if isinstance(load, TimeSection):
         from magshell_fenicsx.simulate.transient import motion_records  # steps at rest do without
 
         held_conjugates = held_conjugates_of_step(scene, step, state)
-        return (yield from motion_records(scene, load.motion, state, held_conjugates))
+        return (yield from motion_records(scene, load, state, held_conjugates))
     if load.touches:
         state = state_at_first_contact(scene, step, state)
     course = load.course(_step_start(scene, step, state))
@@ -101,7 +102,7 @@ def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepC
     stage = make_stage(scene, state, held_conjugates, course.curves and (step.name, *course.curves))
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     path = _with_step_options(scene, path, course, drive)
-    is_to_target = course.until == "target" or load.limit_target
+    is_to_target = course.until == "target" or load.end.bound
     is_at_end = drive.end is not None and not drive.targets
     if is_at_end and is_to_target:
         yield Record("target", step.name, stage.point(start))
@@ -109,7 +110,7 @@ def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepC
     goal = ContinuationGoal(
         course.until, drive.targets, drive.quantity, course.steps or MAX_STEPS, drive.first
     )
-    stream = RecordStream(follow_path(stage, path, start, goal, load.branch_points))
+    stream = RecordStream(follow_path(stage, path, start, goal, load.end.branch_points))
     forbidden, first_instability = "", None
     for record in stream:
         is_located = record.label in LOCATED
@@ -123,10 +124,10 @@ def _along_course(scene: Scene, step: ProgrammeStep, state: State, course: StepC
             raise Stopped(forbidden)
     if forbidden or limit_reason:
         raise Stopped(forbidden or limit_reason)
-    if not (load.branch_points and first_instability):
+    if not (load.end.branch_points and first_instability):
         return stream.end
     if is_symmetry_breaking(first_instability):
-        branch_goal, scale = off_path(goal, load.branch_points), abs(drive.scale)
+        branch_goal, scale = off_path(goal, load.end.branch_points), abs(drive.scale)
         # as branch 1, beside the path of the step
         yield from follow_switched_branch(stage, first_instability, branch_goal, scale, number=1)
     return stream.end
@@ -226,7 +227,7 @@ def leaves_path(step: ProgrammeStep) -> bool:
     """Return whether a step leaves its path at its bifurcation, for a branch or a snap."""
     if step.until != "bifurcation":
         return False
-    return step.load.follows_branch or step.load.released_by is not None
+    return step.load.end.follows_branch or step.load.end.snap is not None
 
 
 def is_symmetry_breaking(record: Record) -> bool:
@@ -273,7 +274,9 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     """Return the stage of a step, a scene with its solver, from any state of the step."""
     # amplitudes that are functions of the step's own one, and the value of this; None without
-    curves = step.load.curves(_step_start(scene, step, state))
+    course = step.load.course(_step_start(scene, step, state))
+    # those of a field that turns are known at the begin of its step alone
+    curves = None if course.at_once else course.curves
     held_conjugates = held_conjugates_of_step(scene, step, state)
     return make_stage(scene, state, held_conjugates, curves and (step.name, *curves))
 

@@ -42,7 +42,7 @@ def has_knockdown(case: Case) -> bool:
     # transferred
     can_be_transferred = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     # with branches or a target the run may end elsewhere than at its fold
-    may_end_elsewhere = bool(loading.branches) or loading.limit_target is not None
+    may_end_elsewhere = bool(loading.branches) or loading.end.bound is not None
     ends_at_fold = loading.until == "limit" and not may_end_elsewhere
     return can_be_transferred and ends_at_fold
 

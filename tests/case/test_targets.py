@@ -75,6 +75,6 @@ def test_mistakes() -> None:
     bare = {"radius": 90, "thickness": 1, "youngs_modulus": 1}
     with pytest.raises(CaseError, match="lengths of the shell with units; a number is in h"):
         case({**PATCH, "depth": "2 mm"}, **bare)
-    assert case({**PATCH, "depth": 2.5}, **bare).programme[0].load.target[1] == 2.5  # type: ignore[index]
+    assert case({**PATCH, "depth": 2.5}, **bare).programme[0].load.end.target[1] == 2.5  # type: ignore[index]
     with pytest.raises(CaseError, match=r"loading\.depth: '4 km'"):
         case({**PATCH, "depth": "4 km"})

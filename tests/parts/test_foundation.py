@@ -39,7 +39,7 @@ def test_plate_under_a_force() -> None:
     """
     case = ms.Case.load(CASES / "foundation.yaml")
     found, l_over_R, force = end(case), 1 / 12, 1e-4
-    assert case.foundation.terms(case.context.scales)[0].value == pytest.approx(
+    assert case.foundation.terms(case.context)[0].value == pytest.approx(
         1e-4 / (12 * 0.91) / l_over_R**4, 1e-6
     )
     assert found["w_over_h"] == pytest.approx(2 * pi * force * l_over_R**2 / 8 * 100, rel=1e-5)
@@ -168,7 +168,7 @@ def test_buckling_is_that_of_ones_own_energy() -> None:
     key = case.model_validate(
         case.model_dump() | {"foundation": {"stiffness": 0.02 / case.shell.R_over_h}}
     )
-    density = key.foundation.terms(key.context.scales)[0].density
+    density = key.foundation.terms(key.context)[0].density
     scene = ms.Scene(case, terms=[ms.OwnTerm("springs", density, (1.0,), 0.02)])
     *_, last = ms.trace(scene, "pressure", first=0.1)
     found = ms.run(key).knockdown
@@ -186,7 +186,7 @@ def test_units() -> None:
     plain = load(
         shell=sphere | {"radius_to_thickness": 100}, foundation={"stiffness": 0.006}, **held
     )
-    terms = [case.foundation.terms(case.context.scales)[0] for case in (si, plain)]
+    terms = [case.foundation.terms(case.context)[0] for case in (si, plain)]
     assert terms[0].value == pytest.approx(terms[1].value, rel=1e-12)
     assert terms[0].value == pytest.approx(0.6, rel=1e-12)
     assert terms[0].parameters[0] == pytest.approx(2 * pi * 1e-4 / 9, rel=1e-12)

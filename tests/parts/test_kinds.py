@@ -3,7 +3,6 @@ found by their types.
 """
 
 from importlib import import_module
-from pathlib import Path
 from pkgutil import iter_modules
 from typing import Annotated, Any, Literal, get_args
 
@@ -11,7 +10,7 @@ import pytest
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.section import Section, numbers_with_units, over_size
-from magshell_fenicsx.parts.kinds import REGISTERED, section_of
+from magshell_fenicsx.parts.registry import REGISTERED, registered_classes
 from magshell_fenicsx.quantities.quantity import PRESSURE
 from magshell_fenicsx.shape.reference_shell import Coordinates
 
@@ -34,17 +33,26 @@ def kinds_of(module: str) -> set[str]:
     return {kind for field in fields if field for kind in get_args(field.annotation)}
 
 
-@pytest.mark.parametrize("room", REGISTERED)
-def test_every_file_with_a_kind_is_in_the_list(room: str) -> None:
-    """But for steps, which have a list of their own."""
-    (folder,) = import_module(f"{PARTS}.{room}").__path__
+@pytest.mark.parametrize(
+    ("role", "package"),
+    [
+        ("bodies", "bodies"),
+        ("imperfections", "imperfections"),
+        ("sources", "magnetism.sources"),
+        ("laws", "laws"),
+    ],
+)
+def test_every_file_with_a_kind_is_in_the_list(role: str, package: str) -> None:
+    """But for steps, which are a list of their own."""
+    (folder,) = import_module(f"{PARTS}.{package}").__path__
     names = [each.name for each in iter_modules([folder])]
-    kinds = {name: name.replace("_", "-") if room == "laws" else name for name in names}
-    files = {kind for name, kind in kinds.items() if kind in kinds_of(f"{PARTS}.{room}.{name}")}
-    assert files == set(REGISTERED[room])
-    for kind in REGISTERED[room]:
-        stem = Path(str(import_module(section_of(room, kind).__module__).__file__)).stem
-        assert kinds[stem] == kind
+    kinds = {name: name.replace("_", "-") if role == "laws" else name for name in names}
+    files = {name for name in names if kinds[name] in kinds_of(f"{PARTS}.{package}.{name}")}
+    registered = [path.removeprefix(f"{package}.").split(".")[0] for path in REGISTERED[role]]
+    assert files == set(registered)
+    key = "law" if role == "laws" else "kind"
+    for section, file in zip(registered_classes(role), registered, strict=True):
+        assert get_args(section.model_fields[key].annotation) == (kinds[file],)
 
 
 CAP = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "poisson_ratio": 0.3}

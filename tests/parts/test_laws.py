@@ -74,10 +74,12 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     package = folder / PACKAGE.name
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(LAW, package / "parts" / "laws")
-    kinds = package / "parts" / "kinds.py"
-    registry = kinds.read_text(encoding="utf-8")
-    assert registry.count('"ogden")') == 1
-    kinds.write_text(registry.replace('"ogden")', '"ogden", "gent")'), encoding="utf-8")
+    registry_file = package / "parts" / "registry.py"
+    registry = registry_file.read_text(encoding="utf-8")
+    line = '        "laws.ogden.OgdenSection",\n'
+    assert registry.count(line) == 1
+    with_gent = registry.replace(line, line + '        "laws.gent.GentSection",\n')
+    registry_file.write_text(with_gent, encoding="utf-8")
     path = os.pathsep.join([str(folder), *sys.path])
     return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
 

@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.contact_step import ContactSection
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.shape.outline import Outline
@@ -380,14 +378,3 @@ def _refined_minimum(
             best, minimum = trial_places[values.argmin()], float(values.min())
         reach = RANGE_REDUCTION * reach
     return minimum
-
-
-def account(context: Context, loads: Loads) -> Account:
-    """Return the lines of `magshell check` on the bodies and the stiffness of their penalties."""
-    bodies, with_units = context.sections["bodies"], context.shell.with_units
-    lines = [
-        f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without "
-        f"friction, stiffness k R²/(E h) = {contact.stiffness:.4g}"
-        for contact in loads.contacts
-    ]
-    return Account(lines)

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Name, over_size
-from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import (
-    Control,
     LoadStart,
     StepCourse,
     StepStart,
@@ -48,6 +47,7 @@ class ContactSection(PathStep):
     """
 
     conjugate: ClassVar[str] = "force on the body"
+    load_control: ClassVar[str] = "approach"
     conjugate_control: ClassVar[str] = "force"
     touches: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
@@ -75,17 +75,16 @@ class ContactSection(PathStep):
     def place(self) -> Any:
         return self.body
 
-    def name_in(self, context: Context, loads: Sequence[Step]) -> str:
+    def approach_in(self, name_by_body: Mapping[str, str]) -> str:
         """Return the name of the load parameter that this step drives: the approach of its body.
 
-        `loads` are the loads of all steps of the case, on which the names of approaches depend.
+        `name_by_body` has the names of the approaches of all bodies, see `approaches`.
         """
-        name_by_body = approaches(context.sections["bodies"], loads)
         # a step without `body` is for the only one; `refuse_unfit` reports other cases
         body = str(self.body or next(iter(name_by_body), ""))
         return name_by_body.get(body, self.amplitude)
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a step whose body is not in the case, or is missing where there are several.
 
         Raises
@@ -98,11 +97,9 @@ class ContactSection(PathStep):
         is_known = len(bodies) == 1 if self.body is None else self.body in bodies
         if not is_known:
             allowed = ", ".join(bodies) or "none: give it in bodies"
-            raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {allowed}")
-
-    @property
-    def prescribed(self) -> Control:
-        return "load" if self.control == "approach" else super().prescribed
+            raise ValueError(
+                f"{context.step.key}.body: {self.body or 'is missing'}; allowed: {allowed}"
+            )
 
     def course(self, step_start: StepStart) -> StepCourse:
         """Return the course of the step, with step control fit for contact."""
@@ -213,6 +210,16 @@ class BodiesObservables(Observables):
     curve_amplitudes = (
         Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),
     )
+
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on bodies and their penalties."""
+        bodies, with_units = context.sections["bodies"], context.shell.with_units
+        lines = [
+            f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without "
+            f"friction, stiffness k R²/(E h) = {contact.stiffness:.4g}"
+            for contact in loads.contacts
+        ]
+        return Account(lines)
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         """Return the numbers of all bodies in a state: approach, and stiffness of the penalty."""

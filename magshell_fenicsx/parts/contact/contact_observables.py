@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
@@ -57,6 +58,16 @@ class ContactObservables(Observables):
             each=True,
         ),
     )
+
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on pairs that may touch, with their stiffness."""
+        return Account(
+            [
+                f"contact of {pair.words} without friction, stiffness k R²/(E h) = "
+                f"{pair.stiffness:.4g}{', as given' if pair.has_given_stiffness else ''}"
+                for pair in loads.pairs
+            ]
+        )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         """Return the names under which a state stores the penalty's stiffness of all pairs."""

@@ -8,12 +8,12 @@ In goes the section, out come the pairs of a model (`Pair`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import Section
-from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
+from magshell_fenicsx.parts.ability import Context, KeyAbility, Modelled
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
@@ -130,15 +130,14 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return [patch_constraint("contact", names, assembly)]
 
-    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return `pairs` of the model's `Loads`: the pairs that may touch, dimensionless."""
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the pairs that may touch, dimensionless."""
+        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
+
         # several shells, each with a modulus of its own; only a mesh can have them
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        return {
-            "pairs": model_pairs(
-                self.sections, context.shell.poisson_ratio, assembly.moduli if assembly else {}
-            )
-        }
+        moduli = assembly.moduli if assembly else {}
+        return Loads(pairs=model_pairs(self.sections, context.shell.poisson_ratio, moduli))
 
 
 def model_pairs(
@@ -226,10 +225,10 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
         raise ValueError(f"contact: {WHOLE_SHELL} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface")
     for step in context.steps:
-        _refuse_step(step, context)
+        _refuse_step(step)
 
 
-def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
+def _refuse_step(step: "ProgrammeStep") -> None:
     """Refuse a step that multiplies imperfections, since undeformed gaps would change.
 
     Raises
@@ -237,19 +236,8 @@ def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
     ValueError
         With the key of the step.
     """
-    if step.load.multiplies(step, context):
+    if step.load.changes_gaps:
         key = f"{step.key}.kind: {step.kind}"
         raise ValueError(
             f"{key}: with contact, undeformed gaps would change: take steps along a path"
         )
-
-
-def account(context: Context, loads: "Loads") -> Account:
-    """Return the lines of `magshell check` on pairs that may touch, with their stiffness."""
-    return Account(
-        [
-            f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"
-            + (", as given" if pair.has_given_stiffness else "")
-            for pair in loads.pairs
-        ]
-    )

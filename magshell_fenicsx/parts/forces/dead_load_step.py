@@ -22,11 +22,10 @@ from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
-from magshell_fenicsx.parts.ability import Context, Formulas, Modelled, Scales
+from magshell_fenicsx.parts.ability import Account, Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.step_course import LoadStart, SizingContext, Target, Until
+from magshell_fenicsx.parts.step_course import LoadStart, MeshHints, SizingContext, Target, Until
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.meridian_chart import (
@@ -173,7 +172,6 @@ class DeadSection(PathStep):
     """
 
     amplitude: ClassVar[str] = "load"
-    conjugate: ClassVar[str] = "displacement along the loads"
     in_lengths: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
         "factor": Target("load", "load_factor"),
@@ -226,40 +224,40 @@ class DeadSection(PathStep):
         return self.loads
 
     @property
-    def held_conjugate(self) -> bool:
-        return not (self.turns or self.by_place)
+    def conjugate(self) -> str:  # type: ignore[override]  # a moment or a potential has none
+        return "" if self.turns or self.by_place else "displacement along the loads"
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a case without a modulus, or without a point that a load names."""
         context.has_modulus("loads of kind: dead")
         for i, load in enumerate(self.loads):
-            context.has_point(f"{step.key}.loads.{i}.at", load.at)
+            context.has_point(f"{context.step.key}.loads.{i}.at", load.at)
 
-    def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
+    def warning(self, context: Context, places: Array) -> str | None:
         """Return a warning that a pressure by formula keeps its direction, unlike that of a fluid.
 
         Formulas of components are such a pressure too if they are along the normals of a curved
         surface. Without such a load the result is None.
-
-        Parameters
-        ----------
-        outline
-            The undeformed shell.
-        length
-            Length R in the unit of the formulas.
         """
+        from magshell_fenicsx.parts.shell_outline import outline
+
         for i, load in enumerate(self.loads):
             if isinstance(load.pressure, str):
                 key = "pressure"
-            elif _is_normal_by_components(load, outline, length):
+            elif load.per_area and load.varies:
+                # along the normals of the perfect shell
+                perfect, length = outline(context.shell), context.shell.reference
+                if not is_normal(load.per_area, perfect, length):
+                    continue
                 key = "per_area"
             else:
                 continue
             # one warning for all such loads: the first of them is named
             return (
-                f"{step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the material and "
-                "along the undeformed normal; a live one, as of a fluid, turns with the surface (a "
-                "ring buckles at 3/4 of the dead one) and is the same everywhere: kind: pressure"
+                f"{context.step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the "
+                "material and along the undeformed normal; a live one, as of a fluid, turns with "
+                "the surface (a ring buckles at 3/4 of the dead one) and is the same everywhere: "
+                "kind: pressure"
             )
         return None
 
@@ -287,7 +285,7 @@ class DeadSection(PathStep):
         return abs(self.factor or 1.0)
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that the loads preserve: of all together, and of each potential.
 
@@ -374,7 +372,7 @@ class DeadSection(PathStep):
             if load.potential
         )
 
-    def named_points(self) -> list[str]:
+    def concentrated(self, context: Context, outline: "Outline") -> Sequence[str]:
         return [load.at for load in self.loads if load.at]
 
     @classmethod
@@ -385,30 +383,24 @@ class DeadSection(PathStep):
         x, y = map(float, place)
         # how fast elements grow with the distance; the disc has no radius, so that they grow from
         # the point on
-        growth = loads[0].growth(sizing)
+        growth = loads[0].mesh_hints(sizing).growth
         return [DiscFeature((x, y), radius=0.0, size=sizing.h, growth=growth)]
 
-    def largest(self, sizing: SizingContext) -> float | None:
+    def mesh_hints(self, sizing: SizingContext) -> MeshHints:
         """Return the largest size of elements over R: 2 sqrt(h/R) of a thin shell.
 
-        It is None of a thick shell, which has no bound of its own.
+        A thick shell has no bound of its own.
         """
         size = 2 * sqrt(sizing.h)  # h is over R
-        return size if size < 0.35 else None
+        return MeshHints(largest=size if size < 0.35 else None)
 
-    def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
-        """Yield the keys of all loads that may be formulas, with bounds and unit of places.
-
-        Parameters
-        ----------
-        key
-            Key of the step in the case file.
-        """
+    def formulas(self, context: Context) -> Iterable[Formulas]:
+        """Yield the keys of all loads that may be formulas, with bounds and unit of places."""
         from magshell_fenicsx.models.shell.spatial_fields import (
             MAX_COMPONENT,
         )  # the solver takes long to import
 
-        scales = context.scales
+        scales, key = context.scales, context.step.key
         for i, load in enumerate(self.loads):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
@@ -430,22 +422,22 @@ class DeadSection(PathStep):
                     deformed=True,
                 )
 
-    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return `dead` of the model's `Loads`: the step's amplitude -> its loads, dimensionless.
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the step's amplitude -> its loads, dimensionless.
 
         Loads on edges that the mirror removes from the model are left out.
         """
-        from magshell_fenicsx.parts.forces.load_vectors import (
-            dead_load,
-        )  # the solver takes long to import
+        # the solver takes long to import
+        from magshell_fenicsx.parts.forces.load_vectors import dead_load
+        from magshell_fenicsx.parts.loads import Loads
 
-        mirror = modelled.mirror
+        mirror, name = modelled.mirror, context.step.name
         loads = (load for load in self.loads if not mirror or load.edge not in mirror.removed_edges)
         dead_loads = (
-            dead_load(load, f"{step.name}_potential_{i}", context, modelled)
+            dead_load(load, f"{name}_potential_{i}", context, modelled)
             for i, load in enumerate(loads)
         )
-        return {"dead": {step.name: tuple(dead_loads)}}
+        return Loads(dead={name: tuple(dead_loads)})
 
 
 def load_turns(load: DeadLoadSection, meridian: MeridianChart, R: float) -> bool:
@@ -482,13 +474,6 @@ def is_normal(components: Sequence[Varying], outline: "Outline", length: float) 
     return bool(
         is_curved and largest_tangential < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max()
     )
-
-
-def _is_normal_by_components(load: DeadLoadSection, outline: "Outline", length: float) -> bool:
-    """Return whether a load has formulas per area that are along the normals (`is_normal`)."""
-    if not load.per_area or not load.varies:
-        return False
-    return is_normal(load.per_area, outline, length)
 
 
 def _has_image(
@@ -608,7 +593,7 @@ class ForcesObservables(Observables):
     quantities = (
         Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
     )
-    before_points: ClassVar[bool] = True
+    column_rank: ClassVar[int] = 0
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return (*loads.forces, *loads.dead)
@@ -618,17 +603,43 @@ class ForcesObservables(Observables):
         factors = (amplitude(name).column for name in self.amplitudes(loads) if name != "force")
         return (*factors, *(f"w_{name}_over_h" for name in also_displaced(loads)))
 
-    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        """Return column -> value at a state: factors of loads, and displacements along them over h.
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on forces and dead loads.
 
-        Collective.
+        Without forces it lists them as left out.
         """
-        model, loads = view.model, view.loads
-        factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
-        displaced = also_displaced(loads)
-        return factors | {
-            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h
-            for name in displaced
+        # radii of patches over h, 0 for a point
+        radii = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
+        lines = [
+            f"force on a patch of radius {radius:g} h" if radius else "force at a point"
+            for radius in radii
+        ]
+        if dead := loads.all_dead:
+            lines.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
+        return Account(lines, left_out=[] if loads.forces else ["force: none"])
+
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return column -> value at a state: factors of loads, and displacements over h.
+
+        The displacements are those along the loads, of the loaded point, and of the pole, which
+        takes the place of the others where nothing is loaded. Collective.
+        """
+        model, loads, h = view.model, view.loads, view.h
+        pole = model.deflection(state.u, "pole") / h
+        force = loads.forces.get("force")
+        displaced = {f"w_{name}_over_h": name for name in also_displaced(loads)}
+        if loads.displaced:
+            displaced["w_over_h"] = loads.displaced
+        return {
+            "force": 0.0,
+            "w_over_h": pole,
+            "w_pole_over_h": pole,
+            "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
+            **{amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)},
+            **{
+                column: model.loaded_deflection(state.u, name) / h
+                for column, name in displaced.items()
+            },
         }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:

@@ -18,15 +18,22 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.section import Direction, over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
-from magshell_fenicsx.mesh.mirror import ROUNDING
+from magshell_fenicsx.mesh.mirror import ROUNDING, rotation
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.step_course import LoadStart, SizingContext, Target, Until
+from magshell_fenicsx.parts.step_course import (
+    ChartOfPlace,
+    LoadStart,
+    MeshHints,
+    SizingContext,
+    Target,
+    Until,
+)
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, tilted
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -82,7 +89,7 @@ class IndentationSection(PathStep):
     def place(self) -> Any:
         return self.at, self.patch
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a force at the edge, at an unknown point, or concentrated on a solid.
 
         Raises
@@ -90,8 +97,8 @@ class IndentationSection(PathStep):
         ValueError
             With the key and what is allowed.
         """
-        context.on_shell(step.key, self.at.polar)
-        context.has_point(f"{step.key}.at.point", self.at.point)
+        context.on_shell(context.step.key, self.at.polar)
+        context.has_point(f"{context.step.key}.at.point", self.at.point)
         if context.solid and not self.patch:
             raise ValueError(
                 "loading.patch: 0: a point force sinks into a solid without limit; give the patch "
@@ -100,10 +107,10 @@ class IndentationSection(PathStep):
             )
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that the force preserves: mirrors through its place."""
-        place = self.place_on(step, context, outline)
+        place = self._place_on(context, outline)
         reason = "the force is not at the pole" if tilted(place) else None
         return [
             SymmetryConstraint(
@@ -111,7 +118,7 @@ class IndentationSection(PathStep):
             )
         ]
 
-    def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array:
+    def _place_on(self, context: Context, outline: "Outline") -> Array:
         """Return the place (3,) of the force over R, in the case's frame.
 
         Raises
@@ -119,7 +126,7 @@ class IndentationSection(PathStep):
         CaseError
             If the section does not say where the force is on this geometry.
         """
-        at, geometry, key = self.at, context.shell.geometry, step.key
+        at, geometry, key = self.at, context.shell.geometry, context.step.key
         if at.point is not None:
             return np.asarray(np.array(context.points[at.point]) / context.shell.reference)
         # of shells that are no spheres only the pole, centre or tip is a direction
@@ -144,25 +151,31 @@ class IndentationSection(PathStep):
         chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
         return np.asarray(outline.embedding(chart[None])[0])
 
-    def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
-        """Return the place of the force in the chart of a frame turned about e3 by `turn` radians.
+    def concentrated(self, context: Context, outline: "Outline") -> Sequence[ChartOfPlace]:
+        """Return the place of the force, as its chart.
 
-        On a sphere it follows from the angles, which are exact. With `half` only half of the shell
-        is modelled, and the place is put exactly on its plane of symmetry: coordinate zero.
+        On a sphere it follows from the angles, which are exact. If half of the shell is modelled,
+        the place is exactly on its plane of symmetry: coordinate zero.
         """
-        if self.at.point is not None or not outline.sphere:
-            return super().chart_of(place, outline, turn, half=half)
-        polar, theta = radians(self.at.polar), radians(self.at.azimuth) - turn
-        return (
-            polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)])
-            if polar
-            else np.zeros(2)
-        )
+        place = self._place_on(context, outline)
 
-    def refuse_unfit_place(
-        self, step: ProgrammeStep, context: Context, outline: "Outline", chart_place: Array
-    ) -> None:
+        def chart(turn: float, half: bool) -> Array:
+            """Return the place in the chart of a frame turned about e3 by `turn` radians."""
+            if self.at.point is not None or not outline.sphere:
+                chart_of_place = outline.inverse(rotation(turn) @ place)
+                return outline.on_half(chart_of_place) if half else chart_of_place
+            polar, theta = radians(self.at.polar), radians(self.at.azimuth) - turn
+            y = 0.0 if half else np.sin(theta)
+            return polar * np.array([np.cos(theta), y]) if polar else np.zeros(2)
+
+        if self.patch:
+            self._refuse_unfit_patch(context, outline, chart(0.0, False))
+        return [chart]
+
+    def _refuse_unfit_patch(self, context: Context, outline: "Outline", chart: Array) -> None:
         """Check that the patch of the force fits between its place and the shell's edge.
+
+        `chart` (2 | 3,) is the place.
 
         Raises
         ------
@@ -173,14 +186,12 @@ class IndentationSection(PathStep):
         # to be 1, or the width of a strip if that is less
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         distance_to_edge = (
-            outline.edge - float(np.hypot(*chart_place[:2]))
-            if outline.sphere
-            else min(1.0, width or 1.0)
+            outline.edge - float(np.hypot(*chart[:2])) if outline.sphere else min(1.0, width or 1.0)
         )
         largest = distance_to_edge * context.shell.R_over_h
-        if self.patch and not 0.3 <= self.patch <= largest:
+        if not 0.3 <= self.patch <= largest:
             raise CaseError(
-                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to "
+                f"{context.step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to "
                 f"{largest:.4g}, where it reaches the edge"
             )
 
@@ -207,7 +218,7 @@ class IndentationSection(PathStep):
         # the radius of the disc over R: the ridge's radius times a factor by experience, and a
         # margin
         dent_radius = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
-        growth = loads[0].growth(sizing)
+        growth = loads[0].mesh_hints(sizing).growth
         # elements at the patch are not finer than h: else they would resolve the stretch under a
         # point force, which is logarithmic and has no limit
         return [
@@ -217,27 +228,23 @@ class IndentationSection(PathStep):
             DiscFeature((x, y), radius=patch * h, size=max(patch * h / 2, h), growth=growth),
         ]
 
-    def growth(self, sizing: SizingContext) -> float:
-        return 0.5 if sizing.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
+    def mesh_hints(self, sizing: SizingContext) -> MeshHints:
+        """Return growth and size of elements along the edge; both are larger for a shell.
 
-    def rim(self, sizing: SizingContext) -> float:
-        """Return the size of elements along the edge over sqrt(Rh); larger for a shell.
-
-        The edge of a hemisphere is far from a dent.
+        Far from the ridge degree 2 needs more elements than degree 4. The edge of a hemisphere is
+        far from a dent.
         """
-        return 2.0 if sizing.solid else 2.8
+        return MeshHints(growth=0.5, rim=2.0) if sizing.solid else MeshHints(growth=0.6, rim=2.8)
 
-    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return `forces` of the model's `Loads`: the step's amplitude -> the force."""
-        from magshell_fenicsx.models.shell.parameters import (
-            Force,
-        )  # the solver takes long to import
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the step's amplitude -> the force."""
+        # the solver takes long to import
+        from magshell_fenicsx.models.shell.parameters import Force
+        from magshell_fenicsx.parts.loads import Loads
 
-        return {
-            "forces": {
-                step.name: Force(modelled.vertices[step.name], self.patch / context.shell.R_over_h)
-            }
-        }
+        name = context.step.name
+        force = Force(modelled.vertices[name], self.patch / context.shell.R_over_h)
+        return Loads(forces={name: force})
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the first change of the force, in its unit 2 pi D/R.

@@ -45,9 +45,8 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     pattern_on_edge,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.ability import Account, Context, Modelled
+from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.forces.dead_load_step import DeadLoadSection, potential
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.platform import compat
 
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
@@ -406,22 +405,6 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
         )
     assert load.pressure is not None
     return InwardPressure(FormulaVectors([formula_function(load.pressure)], Q, length, factor))
-
-
-def account(context: Context, loads: Loads) -> Account:
-    """Return the lines of `magshell check` on forces and dead loads.
-
-    Without forces it lists them as left out.
-    """
-    # radii of patches over h, 0 for a point
-    radii = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
-    lines = [
-        f"force on a patch of radius {radius:g} h" if radius else "force at a point"
-        for radius in radii
-    ]
-    if dead := loads.all_dead:
-        lines.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
-    return Account(lines, left_out=[] if loads.forces else ["force: none"])
 
 
 class Measures(Protocol):

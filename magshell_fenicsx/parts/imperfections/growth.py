@@ -32,6 +32,7 @@ class ImperfectionStep(LoadStep):
 
     amplitude: ClassVar[str] = "imperfection"
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "imperfection")}
+    changes_gaps: ClassVar[bool] = True
     kind: Literal["imperfection"]
     item: int | None = Field(default=None, ge=0)
     """Number of the imperfection in shell.imperfections, from 0; all of them together by default"""
@@ -45,21 +46,17 @@ class ImperfectionStep(LoadStep):
     def on_perfect(self, *, last: bool) -> None:
         return None
 
-    def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
-        return grown_by([step], context.sections["imperfections"])[step.name]
+    def account(self, context: Context) -> str:
+        return f"{context.step.name} grows: {', '.join(_grown_in(context))}"
 
-    def account(self, step: ProgrammeStep, context: Context) -> str:
-        return f"{step.name} grows: {', '.join(self.multiplies(step, context))}"
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the step's amplitude -> the deviations that its factor multiplies."""
+        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
 
-    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return the step's amplitude -> the deviations that its factor multiplies, for `Loads`."""
-        return {
-            "growing_imperfections": {
-                step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))
-            }
-        }
+        deviations = tuple(modelled.deviations[key] for key in _grown_in(context))
+        return Loads(growing_imperfections={context.step.name: deviations})
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Check that the case has the imperfection of the step, which no other step may share.
 
         Raises
@@ -67,22 +64,22 @@ class ImperfectionStep(LoadStep):
         ValueError
             With the key and what is allowed.
         """
+        key = context.step.key
         imperfections: Mapping[str, object] = context.sections["imperfections"]
         load_of_amplitude = context.loads(ImperfectionStep)  # amplitude -> section of its step
-        context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
+        context.needs(f"{key}.kind: imperfection", "a mid-surface")
         if not imperfections:
             raise ValueError(
-                f"{step.key}.kind: imperfection: the case has none; give shell.imperfections"
+                f"{key}.kind: imperfection: the case has none; give shell.imperfections"
             )
-        if not grown_by([step], imperfections)[step.name]:
+        if not _grown_in(context):
             raise ValueError(
-                f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted "
-                "from 0"
+                f"{key}.item: {self.item}: shell.imperfections has no such item, counted from 0"
             )
         # without an item the step grows all, which another step may not
-        if load_of_amplitude[step.name].item is None and len(load_of_amplitude) > 1:
+        if load_of_amplitude[context.step.name].item is None and len(load_of_amplitude) > 1:
             raise ValueError(
-                f"{step.key}.item: give it: another step grows another item of shell.imperfections"
+                f"{key}.item: give it: another step grows another item of shell.imperfections"
             )
 
 
@@ -98,8 +95,13 @@ class GrowingObservables(Observables):
         ),
     )
 
-    def free_amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(loads.growing_imperfections)
+    def free_amplitudes(self, loads: "Loads") -> Mapping[str, float]:
+        return dict.fromkeys(loads.growing_imperfections, 0.0)
+
+
+def _grown_in(context: Context) -> list[str]:
+    """Return the keys of the imperfections that the step of a context multiplies."""
+    return grown_by([context.step], context.sections["imperfections"])[context.step.name]
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:

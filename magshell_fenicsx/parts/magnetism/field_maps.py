@@ -2,7 +2,7 @@
 of a path.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -20,12 +20,11 @@ from magshell_fenicsx.parts.magnetism.sensors import (
     refuse_unknown_field,
     units,
 )
-from magshell_fenicsx.parts.observables import MapGrid, ModelView, Observables
+from magshell_fenicsx.parts.observables import MapGrid, ModelView
 from magshell_fenicsx.shape.reference_shell import Coordinates
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
-    from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
 MAX_PLACES = 1_000_000  # places of one map
@@ -176,32 +175,26 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
         ]
 
 
-class FieldMapsObservables(Observables):
-    """Grids of the magnetic field, as observables."""
+def maps_at(view: ModelView, state: "State") -> list[MapGrid]:
+    """Return the grids of all maps with the flux density at a state; collective.
 
-    def grids(self, loads: "Loads") -> Sequence[str]:
-        return [field_map.grid.name for field_map in loads.field_maps]
+    Each has values (n, 3) in the unit of its `MapGrid`. `view` is the model with the frame and
+    units in which it is reported. A map of the shell's own field has no applied field.
+    """
+    from magshell_fenicsx.parts.magnetism.readings import (
+        field_at,
+    )  # the solver takes long to import
 
-    def on_grids(self, view: ModelView, state: "State") -> list[MapGrid]:
-        """Return the grids of all maps with the flux density at a state; collective.
-
-        Each has values (n, 3) in the unit of its `MapGrid`. `view` is the model with the frame and
-        units in which it is reported. A map of the shell's own field has no applied field.
-        """
-        from magshell_fenicsx.parts.magnetism.readings import (
-            field_at,
-        )  # the solver takes long to import
-
-        return [
-            replace(
-                field_map.grid,
-                values=field_at(
-                    view,
-                    state,
-                    field_map.places,
-                    field_map.own,
-                    field_map.applied if field_map.total else 0.0,
-                ),
-            )
-            for field_map in view.loads.field_maps
-        ]
+    return [
+        replace(
+            field_map.grid,
+            values=field_at(
+                view,
+                state,
+                field_map.places,
+                field_map.own,
+                field_map.applied if field_map.total else 0.0,
+            ),
+        )
+        for field_map in view.loads.field_maps
+    ]

@@ -9,7 +9,8 @@
 - `turn` is the angle (rad) about e3 by which the model's frame is turned.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from math import acos, degrees
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -23,7 +24,6 @@ from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, stre
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import (
-    Curves,
     Drive,
     ExpectedEnd,
     LoadStart,
@@ -51,6 +51,7 @@ class FieldSection(FactorStep):
     amplitude: ClassVar[str] = "lambda_m"
     section: ClassVar[str] = "magnetic"
     label: ClassVar[Literal["", "field"]] = "field"
+    rank_before_load: ClassVar[int] = 4
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "lambda_m")}
     kind: Literal["field"]
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
@@ -60,11 +61,8 @@ class FieldSection(FactorStep):
         """Return lambda_m of the case: it counts as of order one in the arc length."""
         return load_start.size
 
-    def size(self, context: Context) -> float:
-        return strength(context)
-
     @classmethod
-    def level(cls, text: str, context: Context) -> float:
+    def history_value(cls, text: str, context: Context) -> float:
         """Return a flux density as a factor of that of `magnetic.applied`.
 
         `text` is a number with a unit, a value of a load as a function of time.
@@ -79,18 +77,37 @@ class FieldSection(FactorStep):
             raise ValueError("needs magnetic.applied.flux_density")
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
-    def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
-        """Return curves of the field's components, and the strength where they begin.
+    def course(self, step_start: StepStart) -> StepCourse:
+        """Return the course of the step, along the present direction of the field.
 
-        The curves are by amplitude, as functions of the strength along the present direction. None
-        if this is the first direction: then lambda_m alone drives the field.
+        Beside its first direction, the course has curves of the field's components, as functions of
+        the strength along the present one. The field has no conjugate displacement.
         """
         from magshell_fenicsx.parts.magnetism.direction import (
             straight,
         )  # the solver takes long to import
 
+        def nothing(name: str) -> float:
+            """Return the conjugate of the field, and its unit."""
+            return 0.0
+
         direction, value = self._direction_and_value(step_start)
-        return (straight(direction), value) if direction[1:].any() else None
+        along_direction = replace(
+            step_start,
+            mu={**step_start.mu, step_start.step.name: value},
+            potential=nothing,
+            unit=nothing,
+            size=strength(step_start.context),
+        )
+        course = super().course(along_direction)
+        return (
+            replace(course, curves=(straight(direction), value)) if direction[1:].any() else course
+        )
+
+    def expected_end(self, context: Context, loads: "Loads", turn: float) -> ExpectedEnd | None:
+        """Return the field at the target; None without a target."""
+        target = self.end.target if self.until == "target" else None
+        return ExpectedEnd("", target[1] * strength(context)) if target else None
 
     def _direction_and_value(self, step_start: StepStart) -> tuple[Array, float]:
         """Return the field's direction at the begin of the step, and its strength there.
@@ -106,32 +123,17 @@ class FieldSection(FactorStep):
         direction = components(present_direction, field)
         return direction, float(direction @ field_at(step_start.mu))
 
-    def load_start(self, step_start: StepStart) -> LoadStart:
-        """Return the field's strength where the step begins, along its direction.
-
-        The field has no conjugate displacement: the two entries for it are zero.
-        """
-        _, value = self._direction_and_value(step_start)
-        return LoadStart(
-            value=value,
-            conjugate=0.0,
-            unit=0.0,
-            is_driven=step_start.is_driven,
-            size=self.size(step_start.context),
-            h=step_start.h,
-        )
-
     @classmethod
     def asked_for(cls, context: Context) -> bool:
         """Return whether the case has a field."""
         return bool(strength(context))
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a step without a field."""
         if not strength(context):
             raise ValueError(
-                f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or "
-                "direction"
+                f"{context.step.key}.kind: field needs magnetic.lambda_m, not zero, for its "
+                "target or direction"
             )
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
@@ -152,13 +154,14 @@ class RotationSection(Step):
 
     amplitude: ClassVar[str] = ANGLE
     holdable: ClassVar[bool] = False
+    alters: ClassVar[tuple[str, ...]] = ("lambda_m", "lambda_across", "lambda_third")
     kind: Literal["rotation"]
     to: Direction
     """Its last direction"""
     points: Annotated[int, Field(ge=1, le=10000)] = 12
     """Equal angles to it"""
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Check that there is a field before the step, which it can turn to its direction.
 
         Raises
@@ -166,15 +169,15 @@ class RotationSection(Step):
         ValueError
             If there is none, or if the direction is parallel or opposite to it.
         """
-        start = direction_before(step.number, context)
+        start = direction_before(context.step.number, context)
         if start is None or not strength(context):
             raise ValueError(
-                f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero"
+                f"{context.step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero"
             )
-        driven_amplitudes = context.driven_before(step.number)
+        driven_amplitudes = context.driven_before(context.step.number)
         if context.is_programme and FieldSection.amplitude not in driven_amplitudes:
             raise ValueError(
-                f"{step.key}.kind: rotation needs a field: a step of kind: field before it"
+                f"{context.step.key}.kind: rotation needs a field: a step of kind: field before it"
             )
         if abs(start @ self.to.vector()) > 1 - EQUALITY_TOLERANCE:
             subject = (
@@ -182,17 +185,15 @@ class RotationSection(Step):
                 if self.amplitude in driven_amplitudes
                 else "magnetic.applied"
             )
-            raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {subject}")
+            raise ValueError(
+                f"{context.step.key}.to: must be neither parallel nor opposite to {subject}"
+            )
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the constraint that a plane contains the last direction of the field."""
         return [SymmetryConstraint("the field turns", [self.to.vector()])]
-
-    def changes(self, name: str, mu: Iterable[str]) -> set[str]:
-        """Return the amplitudes that the step changes: its own, `name`, and all of the field."""
-        return {name} | {amplitude for amplitude in mu if amplitude.startswith("lambda_")}
 
     def course(self, step_start: StepStart) -> StepCourse:
         """Return how the step goes on: the field turns to its last direction at constant magnitude.
@@ -238,9 +239,7 @@ class RotationSection(Step):
         )
         return StepCourse(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
 
-    def expected_end(
-        self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
-    ) -> ExpectedEnd:
+    def expected_end(self, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
         """Return the expected end of the step, in words and as an angle (degrees).
 
         The angle is counted from the first direction of the field. It is None if the step does not
@@ -253,7 +252,9 @@ class RotationSection(Step):
         # before each step and after the last one: at the begin of the programme and of the step,
         # and at the end of the step
         all_directions = directions(context.steps, loads.magnetic, turn)
-        first, start, end = (all_directions[i] for i in (0, step.number - 1, step.number))
+        first, start, end = (
+            all_directions[i] for i in (0, context.step.number - 1, context.step.number)
+        )
         angle = degrees(acos(float(np.clip(end @ first, -1, 1))))
         return ExpectedEnd(
             "its last direction", angle if start @ first > 1 - EQUALITY_TOLERANCE else None

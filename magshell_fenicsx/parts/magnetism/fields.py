@@ -13,7 +13,7 @@ and what the section adds to a model.
 - "Refuse" means: raise an error with the key and what is allowed.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from math import isnan, pi, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
@@ -27,7 +27,7 @@ from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.ability import Ability, Context, Formulas, InTime, Modelled
+from magshell_fenicsx.parts.ability import Ability, Context, Formulas, Modelled
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
 from magshell_fenicsx.parts.revolution_sections import SurfaceSection
@@ -36,6 +36,7 @@ from magshell_fenicsx.quantities.quantity import CaseSizes
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -391,17 +392,6 @@ class MagneticSection(Section, Ability):
         if self.remanent:
             _refuse_unfit_remanence(self.remanent, context)
 
-    def in_time(self, context: Context, driven: Collection[str]) -> InTime:
-        """Return the field as a load that may be a function of time.
-
-        `driven` are the amplitudes that earlier steps drive. The result has the name "field", and
-        the reason why the field may not be a load in time, "" if it may.
-        """
-        refused_because = "not after kind: rotation" if ANGLE in driven else ""
-        if not strength(context):
-            refused_because = "needs magnetic.lambda_m, not zero"
-        return InTime("field", refused_because)
-
     def patches(self) -> dict[str, Iterable[str]]:
         """Return the keys that have values by patch -> names of the patches."""
         values = {
@@ -455,13 +445,12 @@ class MagneticSection(Section, Ability):
                 length=1.0,  # places are over R
             )
 
-    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return the fields of the model's `Loads` that the section adds, by name."""
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
         from magshell_fenicsx.parts.magnetism.magnetisation import (
-            adds,
+            contribution,
         )  # the solver takes long to import
 
-        return adds(context, modelled)
+        return contribution(context, modelled)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Check lambda_m, and the values of sources and formulas at places (n, 3) over R.
@@ -560,7 +549,7 @@ class MagneticSection(Section, Ability):
             f"{strengths.max():.4g} mT"
         ]
 
-    def units(self, context: Context, units: CaseSizes) -> CaseSizes:
+    def with_field(self, context: Context, units: CaseSizes) -> CaseSizes:
         """Return the units of a case, with the physical size of lambda_m = 1 added where known.
 
         It is a flux density in mT (`applied`). If sources are the whole field, it is their strength

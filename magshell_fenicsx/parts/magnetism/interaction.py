@@ -5,7 +5,7 @@ the others by its field. The load parameter (amplitude) `interaction` multiplies
 interaction; 1 is the physical value.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -17,7 +17,6 @@ from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.shell_sections import MeshSurface
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.quantities.quantity import Quantity
 
@@ -54,6 +53,7 @@ class InteractionStep(FactorStep):
 
     amplitude: ClassVar[str] = AMPLITUDE
     section: ClassVar[str] = "magnetic"
+    rank_before_load: ClassVar[int] = 3
     targets: ClassVar[dict[str, Target]] = {"factor": Target("load", AMPLITUDE)}
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
@@ -72,11 +72,11 @@ class InteractionStep(FactorStep):
         """Return whether the case has an interaction of magnetised parts."""
         return acts(context)
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a step without an interaction of magnetised parts."""
         if not acts(context):
             raise ValueError(
-                f"{step.key}.kind: interaction needs magnetic.interaction: others or all"
+                f"{context.step.key}.kind: interaction needs magnetic.interaction: others or all"
             )
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
@@ -165,5 +165,5 @@ def refuse_unfit_interaction(context: Context) -> None:
 class InteractionObservables(Observables):
     """The factor of the interaction."""
 
-    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
-        return (AMPLITUDE,) if loads.interaction else ()
+    def free_amplitudes(self, loads: "Loads") -> Mapping[str, float]:
+        return {AMPLITUDE: 0.0} if loads.interaction else {}

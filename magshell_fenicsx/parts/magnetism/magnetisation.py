@@ -39,7 +39,7 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     radial,
     tangential,
 )
-from magshell_fenicsx.parts.ability import Account, Context, Modelled
+from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_maps import field_maps
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
@@ -510,8 +510,8 @@ def _vectors_of_sources(sources: Sequence[SourceSection], R: float) -> list[Arra
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
-def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
-    """Return the fields of the model's `Loads` that magnetism adds, by name.
+def contribution(context: Context, modelled: Modelled) -> Loads:
+    """Return what magnetism adds to the loads of a model.
 
     If a step drives the field, `magnetic` is the magnetisation with the applied field. Otherwise
     `remanence` is the magnetisation alone, as sensors read it. It is left out if the modelled part
@@ -520,16 +520,16 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     magnetic = context.section_of(MagneticSection)
     turn, patch_rims = modelled.turn, modelled.patch_rims
     assert magnetic
-    driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    driven_amplitudes = context.driven_before(len(context.steps) + 1)
     # these are added in any case
-    observed: dict[str, Any] = {
-        "sensors": sensors(context, turn),
-        "field_maps": field_maps(context, turn),
-        "interaction": interaction(context),
-    }
+    observed = Loads(
+        sensors=sensors(context, turn),
+        field_maps=field_maps(context, turn),
+        interaction=interaction(context),
+    )
     if FieldSection.amplitude in driven_amplitudes:
         to = [step.to for step in _rotations(context)]
-        return {"magnetic": magnetisation(magnetic, context, turn, patch_rims, to), **observed}
+        return replace(observed, magnetic=magnetisation(magnetic, context, turn, patch_rims, to))
     if magnetic.remanent is None:
         return observed
     (constraint,) = remanence_constraints(context, modelled.outline)
@@ -539,39 +539,9 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
         return observed
     if modelled.plane and not constraint.mirrors(modelled.plane):
         return observed
-    return {"remanence": magnetisation(magnetic, context, turn, patch_rims), **observed}
+    return replace(observed, remanence=magnetisation(magnetic, context, turn, patch_rims))
 
 
 def _rotations(context: Context) -> list[RotationSection]:
     """Return the steps of a case that turn the field."""
     return [step.load for step in context.steps if isinstance(step.load, RotationSection)]
-
-
-def account(context: Context, loads: Loads) -> Account:
-    """Return the lines of `magshell check` on the energy of the field and on its sources.
-
-    Lines in `included` tell what is in the model, those in `left_out` what is not, with the reason.
-    """
-    magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
-    if loads.interaction:
-        words = [
-            "magnetised parts in each other's field, |Br|²/(mu_0 E) = "
-            f"{loads.interaction.strength:g}"
-        ]
-    if magnetic is None or field is None:
-        reason = "lambda_m is zero" if magnetic else "no magnetic section"
-        return Account(included=words, left_out=[f"magnetic energy: {reason}"])
-    law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
-    if field.soft:
-        remanence_text = "without remanence" if field.soft.alone else "beside the remanence"
-        susceptibility = magnetic.susceptibility
-        if isinstance(susceptibility, int | float):
-            susceptibility = f"{susceptibility:g}"
-        law += (
-            f", soft magnetism of a sheet with the susceptibility {susceptibility} {remanence_text}"
-        )
-        law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
-    sources = enumerate(magnetic.applied.sources or [])
-    words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
-    energy_text = f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}"
-    return Account(included=[energy_text, *words])

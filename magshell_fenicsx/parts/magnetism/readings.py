@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.magnetism.fields import MU_0
+from magshell_fenicsx.parts.ability import Account, Context
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.observables import ModelView, Observables, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -57,6 +58,36 @@ class FieldObservables(Observables):
         """Return no columns: `lambda_m` and `field_angle` are columns of every run."""
         return ()
 
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the lines of `magshell check` on the energy of the field and on its sources.
+
+        Lines in `included` tell what is in the model, those in `left_out` what is not, and why.
+        """
+        magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
+        if loads.interaction:
+            words = [
+                "magnetised parts in each other's field, |Br|²/(mu_0 E) = "
+                f"{loads.interaction.strength:g}"
+            ]
+        if magnetic is None or field is None:
+            reason = "lambda_m is zero" if magnetic else "no magnetic section"
+            return Account(included=words, left_out=[f"magnetic energy: {reason}"])
+        law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
+        if field.soft:
+            remanence_text = "without remanence" if field.soft.alone else "beside the remanence"
+            susceptibility = magnetic.susceptibility
+            if isinstance(susceptibility, int | float):
+                susceptibility = f"{susceptibility:g}"
+            law += (
+                f", soft magnetism of a sheet with the susceptibility {susceptibility} "
+                f"{remanence_text}"
+            )
+            law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
+        sources = enumerate(magnetic.applied.sources or [])
+        words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
+        energy_text = f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}"
+        return Account(included=[energy_text, *words])
+
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return strength and angle of the applied field at a state, column -> value."""
         from magshell_fenicsx.parts.magnetism.direction import (  # the solver takes long to import
@@ -67,29 +98,30 @@ class FieldObservables(Observables):
         angle = field_angle(state.mu, view.loads.magnetic, view.sense)
         return {"lambda_m": field_size(state.mu, view.sense), "field_angle": angle}
 
-    def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
-        """Return the magnetic moment at the end of a path, in the frame of the case; collective.
 
-        It is in A m² with units, else over |Br| R³/μ0, or √(E/μ0) R³ of a shell that is soft alone.
-        The result is {"magnetic_moment": {"value", "unit"}}, or empty if nothing is magnetised.
-        """
-        from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
+def moment_in_summary(view: ModelView, state: "State") -> dict[str, Any]:
+    """Return the magnetic moment at the end of a path, in the frame of the case; collective.
 
-        magnetisation = magnetisation_of(view.loads)
-        if magnetisation is None or magnetisation.absent:
-            return {}
-        at_state = view.model.system.at_state(state)
-        moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(view.azimuth)
-        moment_unit = (
-            magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
-        )
-        unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
-        return {
-            "magnetic_moment": {
-                "value": (moment_unit * moment).tolist(),
-                "unit": "A m²" if magnetisation.metres else unit,
-            }
+    It is in A m² with units, else over |Br| R³/μ0, or √(E/μ0) R³ of a shell that is soft alone.
+    The result is {"magnetic_moment": {"value", "unit"}}, or empty if nothing is magnetised.
+    """
+    from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
+
+    magnetisation = magnetisation_of(view.loads)
+    if magnetisation is None or magnetisation.absent:
+        return {}
+    at_state = view.model.system.at_state(state)
+    moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(view.azimuth)
+    moment_unit = (
+        magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
+    )
+    unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
+    return {
+        "magnetic_moment": {
+            "value": (moment_unit * moment).tolist(),
+            "unit": "A m²" if magnetisation.metres else unit,
         }
+    }
 
 
 class SoftObservables(Observables):
@@ -169,108 +201,107 @@ class SensorsObservables(Observables):
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return tuple(column for sensor in loads.sensors for column in sensor.columns)
 
-    def differentiable(self, loads: "Loads") -> Sequence[str]:
-        """Return the columns of all sensors: each has a `slope`."""
-        return self.columns(loads, ())
-
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return the readings of all sensors, column -> value; collective."""
         if not view.loads.sensors:
             return {}
-        readings = self._readings(view, state, view.loads.sensors)
+        readings = _readings(view, state, view.loads.sensors)
         columns = [column for each in view.loads.sensors for column in each.columns]
         return dict(zip(columns, map(float, readings.ravel()), strict=True))
 
-    def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
-        """Return a sensor's column with its derivatives; None for other columns. Collective.
 
-        Derivatives by displacement and remanence are those of the shell's own field. Derivatives by
-        amplitudes of the applied field are central differences of fourth order: it is read too, or
-        induces a polarisation.
-        """
-        from magshell_fenicsx.parts.magnetism.self_field import self_field
+def slope_of_sensor(view: ModelView, state: "State", column: str) -> Slope | None:
+    """Return a column with its derivatives; None if no sensor has it. Collective.
 
-        # the sensor of the column, and the number of the column's component
-        sensors_and_components = [
-            (sensor, i)
-            for sensor in view.loads.sensors
-            for i, name in enumerate(sensor.columns)
-            if name == column
-        ]
-        if not sensors_and_components:
-            return None
-        (sensor, i), *_ = sensors_and_components
-        self_field_of_model = self_field(view)
-        # e_i of the case in the model's frame, times the unit: the column is direction . B
-        direction = sensor.own * rotation(view.azimuth)[:, i]
-        system = view.model.system
-        at_state, nodes = system.at_state(state), view.model.r0.function_space.dofmap.list
+    Derivatives by displacement and remanence are those of the shell's own field. Derivatives by
+    amplitudes of the applied field are central differences of fourth order: it is read too, or
+    induces a polarisation.
+    """
+    from magshell_fenicsx.parts.magnetism.self_field import self_field
 
-        def nodal_derivatives() -> tuple[Array, Array]:
-            """Return derivatives by u, summed at nodes, and by the remanence in cells."""
-            # by the values at the nodes of each cell
-            derivatives = self_field_of_model.derivatives(state.mu, sensor.place, direction)
-            by_u = np.zeros_like(system.u.x.array)
-            components = derivatives.by_u.shape[2]
-            own_nodes = nodes[: len(derivatives.by_u)]
-            np.add.at(by_u.reshape(-1, components), own_nodes, derivatives.by_u)
-            return by_u, derivatives.by_remanence
+    # the sensor of the column, and the number of the column's component
+    sensors_and_components = [
+        (sensor, i)
+        for sensor in view.loads.sensors
+        for i, name in enumerate(sensor.columns)
+        if name == column
+    ]
+    if not sensors_and_components:
+        return None
+    (sensor, i), *_ = sensors_and_components
+    self_field_of_model = self_field(view)
+    # e_i of the case in the model's frame, times the unit: the column is direction . B
+    direction = sensor.own * rotation(view.azimuth)[:, i]
+    system = view.model.system
+    at_state, nodes = system.at_state(state), view.model.r0.function_space.dofmap.list
 
-        by_u, by_remanence = at_state.evaluate(nodal_derivatives)
-        by_mu = self._derivatives_by_field(view, state, sensor, component=i)
-        (reading,) = self._readings(view, state, [sensor])  # (3,)
-        return Slope(
-            value=float(reading[i]),
-            by_u=at_state.summed(by_u),
-            by_mu=by_mu,
-            field=self_field_of_model.Br,
-            by_field=by_remanence,
+    def nodal_derivatives() -> tuple[Array, Array]:
+        """Return derivatives by u, summed at nodes, and by the remanence in cells."""
+        # by the values at the nodes of each cell
+        derivatives = self_field_of_model.derivatives(state.mu, sensor.place, direction)
+        by_u = np.zeros_like(system.u.x.array)
+        components = derivatives.by_u.shape[2]
+        own_nodes = nodes[: len(derivatives.by_u)]
+        np.add.at(by_u.reshape(-1, components), own_nodes, derivatives.by_u)
+        return by_u, derivatives.by_remanence
+
+    by_u, by_remanence = at_state.evaluate(nodal_derivatives)
+    by_mu = _derivatives_by_field(view, state, sensor, component=i)
+    (reading,) = _readings(view, state, [sensor])  # (3,)
+    return Slope(
+        value=float(reading[i]),
+        by_u=at_state.summed(by_u),
+        by_mu=by_mu,
+        field=self_field_of_model.Br,
+        by_field=by_remanence,
+    )
+
+
+def _derivatives_by_field(
+    view: ModelView, state: "State", sensor: Sensor, component: int
+) -> dict[str, float]:
+    """Return the derivatives of a reading by the amplitudes of the applied field; collective.
+
+    They are central differences. `component` is that of the reading, 0 to 2. Empty if the
+    reading does not depend on the applied field.
+    """
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
+    from magshell_fenicsx.parts.magnetism.self_field import DIFFERENCE_STEP, DIFFERENCE_WEIGHTS
+
+    applied = view.loads.magnetic
+    if not applied:
+        return {}
+    if not sensor.total and not applied.soft:
+        return {}
+    names_of_motions = (name for moving_field in applied.driven for name in moving_field.names)
+    names = {"lambda_m", *TRANSVERSE_AMPLITUDES, *names_of_motions}
+    by_mu = dict[str, float]()
+    for name in sorted(names & state.mu.keys()):
+        value = state.mu[name]
+        step = DIFFERENCE_STEP * (abs(value) or 1.0)
+        readings = dict[int, float]()  # number of steps by which mu is moved -> reading
+        for steps, _ in DIFFERENCE_WEIGHTS:
+            moved_state = State(state.u, {**state.mu, name: value + steps * step})
+            (reading,) = _readings(view, moved_state, [sensor])  # (3,)
+            readings[steps] = reading[component]
+        by_mu[name] = float(
+            sum(weight / step * readings[steps] for steps, weight in DIFFERENCE_WEIGHTS)
         )
+    return by_mu
 
-    def _derivatives_by_field(
-        self, view: ModelView, state: "State", sensor: Sensor, component: int
-    ) -> dict[str, float]:
-        """Return the derivatives of a reading by the amplitudes of the applied field; collective.
 
-        They are central differences. `component` is that of the reading, 0 to 2. Empty if the
-        reading does not depend on the applied field.
-        """
-        from magshell_fenicsx.continuation.system import State
-        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
-        from magshell_fenicsx.parts.magnetism.self_field import DIFFERENCE_STEP, DIFFERENCE_WEIGHTS
+def _readings(view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
+    """Return the readings (sensors, 3) in the frame of the case; collective.
 
-        applied = view.loads.magnetic
-        if not applied:
-            return {}
-        if not sensor.total and not applied.soft:
-            return {}
-        names_of_motions = (name for moving_field in applied.driven for name in moving_field.names)
-        names = {"lambda_m", *TRANSVERSE_AMPLITUDES, *names_of_motions}
-        by_mu = dict[str, float]()
-        for name in sorted(names & state.mu.keys()):
-            value = state.mu[name]
-            step = DIFFERENCE_STEP * (abs(value) or 1.0)
-            readings = dict[int, float]()  # number of steps by which mu is moved -> reading
-            for steps, _ in DIFFERENCE_WEIGHTS:
-                moved_state = State(state.u, {**state.mu, name: value + steps * step})
-                (reading,) = self._readings(view, moved_state, [sensor])  # (3,)
-                readings[steps] = reading[component]
-            by_mu[name] = float(
-                sum(weight / step * readings[steps] for steps, weight in DIFFERENCE_WEIGHTS)
-            )
-        return by_mu
-
-    def _readings(self, view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
-        """Return the readings (sensors, 3) in the frame of the case; collective.
-
-        Only sensors of the total field read the applied one.
-        """
-        places = np.array([sensor.place for sensor in sensors])
-        own_units = np.array([sensor.own for sensor in sensors])[:, None]
-        applied_units = np.array([sensor.applied for sensor in sensors])[:, None]
-        reads_total = np.array([sensor.total for sensor in sensors])[:, None]
-        applied_factors = np.where(reads_total, applied_units, 0.0)
-        return field_at(view, state, places, own_units, applied_factors)
+    Only sensors of the total field read the applied one.
+    """
+    places = np.array([sensor.place for sensor in sensors])
+    own_units = np.array([sensor.own for sensor in sensors])[:, None]
+    applied_units = np.array([sensor.applied for sensor in sensors])[:, None]
+    reads_total = np.array([sensor.total for sensor in sensors])[:, None]
+    applied_factors = np.where(reads_total, applied_units, 0.0)
+    return field_at(view, state, places, own_units, applied_factors)
 
 
 def field_at(

@@ -21,7 +21,6 @@ from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, LoadStep
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import LoadStart, Target
 from magshell_fenicsx.quantities.quantity import DISTANCE, FORCE, TORQUE, TURN, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
@@ -108,13 +107,13 @@ class SourceStep(LoadStep):
             return self.source if 0 <= self.source < len(sources) else None
         return next((i for i, source in enumerate(sources) if source.name == self.source), None)
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse a step that does not fit the case, with a ValueError.
 
         It needs its source, a field that was applied before, and no other motion of the same source
         with `to`.
         """
-        magnetic, key = context.section_of(MagneticSection), step.key
+        magnetic, key = context.section_of(MagneticSection), context.step.key
         sources = (magnetic.applied.sources if magnetic else None) or []
         if self.number(sources) is None:
             names = [source.name or str(i) for i, source in enumerate(sources)]
@@ -123,11 +122,11 @@ class SourceStep(LoadStep):
                 f"allowed: {', '.join(names) or 'none'}"
             )
         is_programme, field_amplitude = context.is_programme, FieldSection.amplitude
-        if is_programme and field_amplitude not in context.driven_before(step.number):
+        if is_programme and field_amplitude not in context.driven_before(context.step.number):
             raise ValueError(
                 f"{key}.kind: source needs the field of its source: a step of kind: field before it"
             )
-        other_steps = (other for other in context.steps if other.name != step.name)
+        other_steps = (other for other in context.steps if other.name != context.step.name)
         other_loads = [other.load for other in other_steps if isinstance(other.load, SourceStep)]
         loads_of_same_source = (
             load for load in other_loads if load.number(sources) == self.number(sources)

@@ -24,8 +24,8 @@ from magshell_fenicsx.parts.motion.history import (
     measured,
     times_of,
 )
-from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
-from magshell_fenicsx.parts.step_course import Errors, ExpectedEnd
+from magshell_fenicsx.parts.step import BALANCE, Step
+from magshell_fenicsx.parts.step_course import Errors, ExpectedEnd, StepEnd
 from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
-NO_FIELD = "needs magnetic.lambda_m, not zero"
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
 
 
@@ -68,7 +67,6 @@ class TimeSection(Step):
     """
 
     amplitude: ClassVar[str] = "time"
-    in_time: ClassVar[bool] = True
     kind: Literal["time"]
     duration: Time
     """How long"""
@@ -147,19 +145,13 @@ class TimeSection(Step):
         """The amplitudes that follow histories."""
         return tuple("lambda_m" if name == "field" else name for name in self.history)
 
-    @property
-    def motion(self) -> "TimeSection":
-        return self
-
-    def expected_end(
-        self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
-    ) -> ExpectedEnd:
+    def expected_end(self, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
         """Return the end of the step in words, after its number of rows."""
         return ExpectedEnd("the end", steps=self.points)
 
     @property
-    def rests(self) -> bool:
-        return self.until == "rest"
+    def end(self) -> StepEnd:
+        return StepEnd(at_rest=self.until == "rest")
 
     @property
     def needs_inertia_alone(self) -> bool:
@@ -167,7 +159,7 @@ class TimeSection(Step):
         needs_equilibrium_or_mode = self.push is not None or bool(self.hold)
         return self.until in ("duration", "event") and not needs_equilibrium_or_mode
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Check that the case has the loads whose histories the step gives, in units that it knows.
 
         Raises
@@ -175,16 +167,16 @@ class TimeSection(Step):
         ValueError
             With the key and what is allowed.
         """
-        key, driven_amplitudes = step.key, context.driven_before(step.number)
-        load_in_time = {
-            in_time.name: in_time
-            for ability in context.abilities
-            if (in_time := ability.in_time(context, driven_amplitudes))
-        }
-        # the section of the field says why it cannot follow a history; without one there is none
-        refusal = load_in_time["field"].refused if "field" in load_in_time else NO_FIELD
-        if "field" in self.history and refusal:
-            raise ValueError(f"{key}.history.field: {refusal}")
+        key = context.step.key
+        if "field" in self.history:
+            # the field has its direction, and a size
+            refusal = ""
+            if "angle" in context.driven_before(context.step.number):
+                refusal = "not after kind: rotation"
+            if "lambda_m" not in _factors_of_sections(context):
+                refusal = "needs magnetic.lambda_m, not zero"
+            if refusal:
+                raise ValueError(f"{key}.history.field: {refusal}")
         # times with units need a case that has units
         for time_key, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
@@ -229,7 +221,7 @@ class TimeSection(Step):
                     raise ValueError(f"{key}.history.{name}: {level}: {e}") from None
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that the initial velocity preserves; all without one."""
         if not self.velocity:
@@ -268,16 +260,11 @@ def _factors_of_sections(context: Context) -> set[str]:
     They grow to a factor without a step of the programme.
     """
     from magshell_fenicsx.parts.path_step import FactorStep
-    from magshell_fenicsx.parts.registered import (  # which has this step too
-        KINDS_BEFORE_LOAD,
-        STEPS,
-    )
+    from magshell_fenicsx.parts.registered import STEPS  # which has this step too
 
-    # kinds of steps that sections of the case put before the steps of its load
-    step_kinds = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {
         step_kind.amplitude
-        for step_kind in step_kinds
+        for step_kind in STEPS.values()
         if issubclass(step_kind, FactorStep) and step_kind.asked_for(context)
     }
 
@@ -297,10 +284,10 @@ def level_in(context: Context, name: str, level: Level) -> float:
     ValueError
         If the load has no such unit in this case.
     """
-    from magshell_fenicsx.parts.registered import step_class  # which has this step too
+    from magshell_fenicsx.parts.registered import step_class_of  # which has this step too
 
     if not isinstance(level, str):
         return level
     # units are known to the kind of the load's step: of the step that the case has, else by name
     step_kind = next((type(step.load) for step in context.steps if step.name == name), None)
-    return (step_kind or step_class(name)).level(level, context)
+    return (step_kind or step_class_of(name)).history_value(level, context)

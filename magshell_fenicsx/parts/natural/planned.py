@@ -17,8 +17,7 @@ from magshell_fenicsx.input.expressions import FormulaVectors, formula_function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim, Pattern, WithinRims
-from magshell_fenicsx.parts.ability import Account, Context
-from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.shell_sections import MeshSurface, PlateSurface, ShellSection
@@ -296,14 +295,3 @@ def natural_constraints(context: Context, outline: Outline) -> list[SymmetryCons
             lambda mirror: mirrored(context, outline, mirror),
         )
     ]
-
-
-def account(context: Context, loads: Loads) -> Account:
-    """Return the line of `magshell check` on the natural shape: what grows.
-
-    A case without a natural shape has a line of what is left out.
-    """
-    if not loads.natural:
-        return Account(left_out=["natural shape: as drawn"])
-    names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
-    return Account([f"natural {names}: strains are measured from there"])

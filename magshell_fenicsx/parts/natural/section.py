@@ -16,10 +16,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, OrInMemory, Section, in_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.ability import Ability, Context, Formulas, Modelled, Offer
+from magshell_fenicsx.parts.ability import Ability, Account, Context, Formulas, Modelled, Offer
 from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.path_step import LoadStep
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -217,13 +217,13 @@ class NaturalSection(Section, Ability):
             value = getattr(self, name)
             yield Formulas(f"natural.{name}", components(value), minimum, maximum, R)
 
-    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
         """Return the natural shape as the model's `Loads` have it."""
-        from magshell_fenicsx.parts.natural.planned import (
-            natural,
-        )  # the solver takes long to import
+        # the solver takes long to import
+        from magshell_fenicsx.parts.loads import Loads
+        from magshell_fenicsx.parts.natural.planned import natural
 
-        return {"natural": natural(context, modelled.turn, modelled.patch_rims)}
+        return Loads(natural=natural(context, modelled.turn, modelled.patch_rims))
 
 
 def components(value: Any) -> list[float | str]:
@@ -247,6 +247,7 @@ class GrowthSection(LoadStep):
         "curvature": Target("load", "natural_curvature"),
         "stretch": Target("load", "natural_stretch"),
     }
+    rank_before_load: ClassVar[int] = 1
     kind: Literal["natural"]
     grows: Literal["curvature", "stretch"] | None = None
     """What grows, where no target says it"""
@@ -266,30 +267,27 @@ class GrowthSection(LoadStep):
         return self
 
     @property
-    def key(self) -> str:
+    def grown_key(self) -> str:
         """The key of `natural` that grows: curvature or stretch."""
         return self.grows or "".join(self._given_targets)
 
     @property
     def amplitude(self) -> str:  # type: ignore[override]
-        return f"natural_{self.key}"
+        return f"natural_{self.grown_key}"
 
     @classmethod
-    def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        """Return steps that let stretch and curvature grow to 1 before the only load of a case.
-
-        There are none if that load is itself a growth, or the case has no natural shape.
-        """
+    def steps_before_load(cls, context: Context) -> list[tuple[str, Step]]:
+        """Return steps that let stretch and curvature grow to 1 before the only load of a case."""
         natural = context.section_of(NaturalSection)
-        if isinstance(loading, cls) or natural is None:
+        if natural is None:
             return []
         keys = [key for key in ("stretch", "curvature") if getattr(natural, key) is not None]
         return [("natural", cls.model_validate({"kind": "natural", key: 1.0})) for key in keys]
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        if getattr(context.section_of(NaturalSection), self.key, None) is None:
+    def refuse_unfit(self, context: Context) -> None:
+        if getattr(context.section_of(NaturalSection), self.grown_key, None) is None:
             raise ValueError(
-                f"loading.{self.key}: is a factor of natural.{self.key}: give that too"
+                f"loading.{self.grown_key}: is a factor of natural.{self.grown_key}: give that too"
             )
 
 
@@ -311,8 +309,18 @@ class NaturalObservables(Observables):
         ),
     )
 
-    def free_amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(loads.natural.amplitudes) if loads.natural else ()
+    def free_amplitudes(self, loads: "Loads") -> Mapping[str, float]:
+        return dict.fromkeys(loads.natural.amplitudes if loads.natural else (), 0.0)
+
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the line of `magshell check` on the natural shape: what grows.
+
+        A case without a natural shape has a line of what is left out.
+        """
+        if not loads.natural:
+            return Account(left_out=["natural shape: as drawn"])
+        names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
+        return Account([f"natural {names}: strains are measured from there"])
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         """Check that the surface has the patches with values of curvature and stretch.

@@ -10,7 +10,7 @@ view is a model with the units in which it is reported. Volumes are over R^3, h 
 from dataclasses import dataclass, replace
 from functools import partial
 from math import copysign, cos, pi, radians, sqrt
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
 
@@ -21,10 +21,11 @@ from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import PathStep
 from magshell_fenicsx.parts.revolution_sections import CapSurface
 from magshell_fenicsx.parts.shell_sections import MeshSurface, ShellSection, Surface
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.step_course import (
     GasSection,
     LoadStart,
+    MeshHints,
     SizingContext,
     StepCourse,
     StepStart,
@@ -39,6 +40,7 @@ INFLATION_STEP_FACTOR = 10.0  # of the largest step of blown-up rubber, times E 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
     from magshell_fenicsx.continuation.point import StepOptions
+    from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.mesh.patch import PatchMesh
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
@@ -50,6 +52,7 @@ class PressureSection(PathStep):
     amplitude: ClassVar[str] = "pressure"
     conjugate: ClassVar[str] = "volume"
     conjugate_control: ClassVar[str] = "volume"
+    divides_whole_way: ClassVar[bool] = False
     targets: ClassVar[dict[str, Target]] = {
         "pressure": Target("load", "p_over_pc"),
         "volume_change": Target("conjugate", "volume_change"),
@@ -67,7 +70,7 @@ class PressureSection(PathStep):
     """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by
     default all from outside. ΔV is then the volume that these sweep"""
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Refuse `on` without several shells or patches, or with another pressure elsewhere.
 
         Raises
@@ -79,31 +82,34 @@ class PressureSection(PathStep):
             return
         if context.solid or not isinstance(context.shell, MeshSurface):
             raise ValueError(
-                f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it "
-                "out"
+                f"{context.step.key}.on: names one of several shells, or a patch of a mesh file: "
+                "leave it out"
             )
         loads = [other.load for other in context.steps]
         if any(
             isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads
         ):
             raise ValueError(
-                f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same "
-                "shells"
+                f"{context.step.key}.on: another step has a pressure elsewhere: there is one, on "
+                "the same shells"
             )
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that a pressure on some patches preserves."""
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return [
-            *super().symmetry_constraints(step, context, outline),
-            patch_constraint(f"{step.key}.on", self.on or (), assembly),
+            *super().symmetry_constraints(context, outline),
+            patch_constraint(f"{context.step.key}.on", self.on or (), assembly),
         ]
 
-    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the faces that are pressed."""
+        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
+
         sides = {"outside": 1.0, "inside": -1.0}
-        return {"pressed_sides": {name: sides[face] for name, face in (self.on or {}).items()}}
+        return Loads(pressed_sides={name: sides[face] for name, face in (self.on or {}).items()})
 
     def course(self, step_start: StepStart) -> StepCourse:
         """Return the course of the step, by arc length where the pressure has no potential.
@@ -130,19 +136,12 @@ class PressureSection(PathStep):
             else self
         )
 
-    @classmethod
-    def implied(cls) -> dict[str, Any]:
-        return {"pressure": True}
-
-    def largest(self, sizing: SizingContext) -> float | None:
+    def mesh_hints(self, sizing: SizingContext) -> MeshHints:
         """Return the largest size of elements over R: it shows buckles of about 3.6 sqrt(Rh).
 
-        With a local imperfection, around which elements are small, it is None.
+        With a local imperfection, around which elements are small, there is none.
         """
-        return None if sizing.local else 1.2 * sqrt(sizing.h)
-
-    def begin(self, step_start: float) -> float:
-        return step_start
+        return MeshHints(largest=None if sizing.local else 1.2 * sqrt(sizing.h))
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the first change of the pressure, 0.1 p_c towards the target."""
@@ -172,34 +171,31 @@ class PressureObservables(Observables):
         for name in loads.pressed_sides:
             patch_of(surface.patches, name, "loading.on")
 
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the line of `magshell check` on a live pressure, or on its absence."""
+        if not loads.pressure:
+            return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
+        if context.solid:
+            return Account(["live pressure on the outer face"])
+        # empty if all of the shell is pressed from outside
+        faces = ", ".join(
+            f"{name} from {'outside' if side > 0 else 'inside'}"
+            for name, side in loads.pressed_sides.items()
+        )
+        return Account([f"live pressure{faces and f' on {faces}'}"])
+
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """Return -dPi/dmu of one unit of the change of volume, R^3; None of other amplitudes."""
         if name != PressureSection.amplitude:
             return None
         return -view.model.material.classical_pressure / view.h / view.model.multiplicity
 
-    def left_out(self, view: ModelView) -> list[str]:
-        """Return messages on edges at which the pressure has no potential."""
-        from magshell_fenicsx.parts.pressure.openings import (
-            no_potential,
-        )  # the solver takes long to import
-
-        open_at = view.model.without_potential if view.loads.pressure else ()
-        return [no_potential(open_at)] if open_at else []
-
-
-def account(context: Context, loads: "Loads") -> Account:
-    """Return the line of `magshell check` on a live pressure, or on its absence."""
-    if not loads.pressure:
-        return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
-    if context.solid:
-        return Account(["live pressure on the outer face"])
-    # empty if all of the shell is pressed from outside
-    faces = ", ".join(
-        f"{name} from {'outside' if side > 0 else 'inside'}"
-        for name, side in loads.pressed_sides.items()
-    )
-    return Account([f"live pressure{faces and f' on {faces}'}"])
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return the pressure and the change of volume, which every run has; collective."""
+        return {
+            "p_over_pc": state.mu.get("pressure", 0.0),
+            "volume_change": view.model.volume_change(state.u, state.mu),
+        }
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,13 @@ from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import LoadStart, Target, Until
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -132,7 +132,7 @@ class EdgeSection(PathStep):
     def scale(self, load_start: LoadStart) -> float:
         return abs(self.factor or 1.0)
 
-    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+    def refuse_unfit(self, context: Context) -> None:
         """Check that `boundary` holds all supports that move.
 
         Raises
@@ -149,12 +149,12 @@ class EdgeSection(PathStep):
             for name in move.supports:
                 if name not in held_names:
                     raise ValueError(
-                        f"{step.key}.moves.{i}.supports: {name}: only what boundary holds "
+                        f"{context.step.key}.moves.{i}.supports: {name}: only what boundary holds "
                         f"(clamped, hinged or held) can move: {', '.join(held_names) or 'nothing'}"
                     )
 
     def symmetry_constraints(
-        self, step: ProgrammeStep, context: Context, outline: "Outline"
+        self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that the motions of supports preserve."""
         R = context.shell.reference
@@ -164,16 +164,15 @@ class EdgeSection(PathStep):
             )
         ]
 
-    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Return the motions of supports as the model's `Loads` have them, over R."""
-        from magshell_fenicsx.models.shell.parameters import Move  # the solver takes long to import
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
+        """Return the motions of supports over R."""
+        # the solver takes long to import
+        from magshell_fenicsx.models.shell.parameters import Move
+        from magshell_fenicsx.parts.loads import Loads
 
-        R, turn = context.shell.reference, modelled.turn
-        return {
-            "moves": tuple(
-                Move(tuple(move.supports), motion(move, step.name, R, turn)) for move in self.moves
-            )
-        }
+        R, turn, name = context.shell.reference, modelled.turn, context.step.name
+        moves = (Move(tuple(move.supports), motion(move, name, R, turn)) for move in self.moves)
+        return Loads(moves=tuple(moves))
 
 
 def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMotion:

@@ -37,6 +37,11 @@ def motion_columns(loads: "Loads") -> dict[str, str]:
     return {name: "reaction" if len(names) == 1 else f"reaction_{name}" for name in names}
 
 
+def moment_columns(loads: "Loads") -> set[str]:
+    """Return the columns of reactions that are moments, while others are forces."""
+    return {column for name, column in motion_columns(loads).items() if only_turns(loads, name)}
+
+
 def motion_size(loads: "Loads", name: str) -> float:
     """Return the sum over supports of the lengths of a motion's translations, over R.
 
@@ -79,6 +84,13 @@ class ReactionsObservables(Observables):
         ),
     )
 
+    def account(self, context: Context, loads: "Loads") -> Account:
+        """Return the line of `magshell check` on supports that move; empty without."""
+        moving_supports = dict.fromkeys(name for move in loads.moves for name in move.names)
+        return Account(
+            [f"supports that move: {', '.join(moving_supports)}"] if moving_supports else []
+        )
+
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(motion_columns(loads))
 
@@ -87,11 +99,6 @@ class ReactionsObservables(Observables):
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return (*super().columns(loads, supports), *columns(supports))
-
-    def moments(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(
-            column for name, column in motion_columns(loads).items() if only_turns(loads, name)
-        )
 
     def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
         return {
@@ -162,9 +169,3 @@ def observed_reactions(
         )
         by_column |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
     return by_column
-
-
-def account(context: Context, loads: "Loads") -> Account:
-    """Return the line of `magshell check` on supports that move; empty without."""
-    moving_supports = dict.fromkeys(name for move in loads.moves for name in move.names)
-    return Account([f"supports that move: {', '.join(moving_supports)}"] if moving_supports else [])

@@ -421,7 +421,7 @@ class History:
         if not self.located:
             no_instability = (
                 "there is no instability up to the target"
-                if steps and steps[-1].load.limit_target
+                if steps and steps[-1].load.end.bound
                 else "the case has neither a load nor a field"
             )
             raise NoResult(stopped or no_instability)
@@ -591,7 +591,7 @@ def at_target(scene: Scene, record: Record) -> Ending:
     """
     system, state = scene.newton.system, record.point.state
     load = scene.problem.programme[record.step - 1].load
-    target = load.target  # a pair: what it prescribes, and the value
+    target = load.end.target  # a pair: what it prescribes, and the value
     # a field that turns by an angle does its work through the component across
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"

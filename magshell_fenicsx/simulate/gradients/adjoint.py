@@ -678,7 +678,7 @@ def _terms_of_held(
 
 def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
     """Return the amplitudes that a step changes along its course."""
-    return step.load.changes(step.name, mu)
+    return {step.name} | (mu.keys() & step.load.alters)
 
 
 def by_load(adjoint: Adjoint, name: str) -> float:
@@ -823,7 +823,7 @@ def held_at(
     if hold is None and step:
         held_conjugates |= held_conjugates_of_step(scene, step, state)
         # a step may prescribe the conjugate of its own amplitude, at least at its target
-        if step.load.by_conjugate(at_target=record.label == "target"):
+        if step.load.end.by_conjugate(at_target=record.label == "target"):
             held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, held_quantity in (hold or {}).items():
         if name not in state.mu or held_quantity not in ("load", "conjugate"):

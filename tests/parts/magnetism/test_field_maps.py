@@ -29,8 +29,8 @@ from magshell_fenicsx.output.pictures.field_maps import (
     with_holes,
 )
 from magshell_fenicsx.output.pictures.plot import PicturedRun, plot
+from magshell_fenicsx.parts.magnetism.field_maps import maps_at
 from magshell_fenicsx.parts.observables import MapGrid
-from magshell_fenicsx.parts.registered import OBSERVABLES
 
 MM = 1e-3
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45,
@@ -90,7 +90,7 @@ def test_a_map_is_many_sensors(symmetry: str, magnetic: dict[str, Any]) -> None:
     here = Scene(Case.from_source(given).problem())
     larger = 0.005 * here.model.r0.x.array[: here.model.system.size]
     state = State(larger, {**here.unloaded().mu, "lambda_m": 1e-3})
-    box, across, below = (grid for room in OBSERVABLES for grid in room.on_grids(here.view, state))
+    box, across, below = maps_at(here.view, state)
     row = here.observe(state)
     read = np.array([[row[f"s{i}_B{axis}"] for axis in "xyz"] for i in range(len(at))])
     np.testing.assert_allclose(box.values, read, rtol=1e-9, atol=1e-15)

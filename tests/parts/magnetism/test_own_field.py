@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charges import ShellFaces, field, moment
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
-from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.magnetism.readings import moment_in_summary, slope_of_sensor
 from magshell_fenicsx.public import follow, run
 
 MM = 1e-3
@@ -384,9 +384,8 @@ def test_slopes_of_a_reading(kind: str) -> None:
         system.zero_at_supports(size * rng.standard_normal(system.size)) for size in (2e-4, 1.0)
     )
     mu = {**here.unloaded().mu, "lambda_m": 0.4}
-    room = next(room for room in OBSERVABLES if "hall_Bx" in room.differentiable(here.model.loads))
     for column in ("hall_Bx", "hall_Bz"):
-        slope = room.slope(here.view, State(u, mu), column)
+        slope = slope_of_sensor(here.view, State(u, mu), column)
         assert slope
 
         def value(u: np.ndarray, mu: dict[str, float], column: str = column) -> float:
@@ -453,7 +452,7 @@ def test_export_to_magpylib() -> None:
     np.testing.assert_allclose(B[1], read, atol=3e-3 * abs(read[2]))
     np.testing.assert_allclose((4 * B[1] - B[0]) / 3, read, atol=1e-4 * abs(read[2]))
     np.testing.assert_allclose(magpylib.getH(fine, place), B[1] / (4e-7 * np.pi), rtol=1e-9)
-    (said,) = (found for room in OBSERVABLES if (found := room.summary(here.view, here.unloaded())))
+    said = moment_in_summary(here.view, here.unloaded())
     volume = 2 * np.pi * (1 - np.sqrt(0.5)) * ((20.5 * MM) ** 3 - (19.5 * MM) ** 3) / 3
     assert said["magnetic_moment"]["value"][2] == pytest.approx(
         0.06 * volume / (4e-7 * np.pi), rel=1e-8
@@ -544,9 +543,7 @@ def moment_and_tip(case: Case) -> tuple[np.ndarray, dict[str, float]]:
     """A m² at the end of the path, and its row."""
     scene = Scene(case.problem())
     *_, last = follow(scene)
-    (found,) = (
-        said for room in OBSERVABLES if (said := room.summary(scene.view, last.point.state))
-    )
+    found = moment_in_summary(scene.view, last.point.state)
     assert found["magnetic_moment"]["unit"] == "A m²"
     return np.array(found["magnetic_moment"]["value"]), scene.observe(last.point.state)
 
@@ -633,5 +630,5 @@ def test_what_has_a_moment(
         {"magnetic": magnetic} if magnetic else {}
     )
     scene = Scene(Case.model_validate(case).problem())
-    said = [found for room in OBSERVABLES if (found := room.summary(scene.view, scene.unloaded()))]
+    said = moment_in_summary(scene.view, scene.unloaded())
     assert bool(said) == there

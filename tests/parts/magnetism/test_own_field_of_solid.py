@@ -15,7 +15,7 @@ import pytest
 from magshell_fenicsx import Case, Scene, gradient
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.registered import OBSERVABLES
+from magshell_fenicsx.parts.magnetism.field_maps import maps_at
 from magshell_fenicsx.public import follow
 
 MM = 1e-3
@@ -108,7 +108,7 @@ def test_a_deformed_block_is_magpylibs_mesh(
     scene = made({"remanent": remanent}, x, symmetry=symmetry, field_maps={"box": box})
     state = moved(scene, lambda X: X @ A.T)
     assert (error(readings(scene, state), body.getB(x)) < 1e-7).all()
-    (grid,) = (grid for room in OBSERVABLES for grid in room.on_grids(scene.view, state))
+    (grid,) = maps_at(scene.view, state)
     drawn = scene.problem.length * grid.places @ np.linalg.inv(A).T - [HALF[0], 0, 0]
     inside = (np.abs(drawn) < HALF).all(axis=1)
     assert 5 < inside.sum() < 30
