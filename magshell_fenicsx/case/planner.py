@@ -68,6 +68,7 @@ from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.supports.boundary import inflation_warning
 from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
     PlacedFormulas,
@@ -939,6 +940,10 @@ def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
     R = case.shell.reference
     warnings += [step.load.warning(step, outline, R) for step in case.programme]
     warnings.append(_unit_warning(case, places))
+    for member in case.several.parts if case.several else ():
+        own_context = replace(member.case.context, steps=context.steps)
+        warning = inflation_warning(own_context, member.name)
+        warnings.append(warning and member.refused(warning))
     return tuple(warning for warning in warnings if warning)
 
 
