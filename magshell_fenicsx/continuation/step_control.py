@@ -34,11 +34,14 @@ class StepEvent:
     loses_forces
         Whether forces of the point are lost at the prediction: then only the tangent at the point
         predicts the next one.
+    is_deep
+        Whether faces may lie deep in each other at the prediction: its correction takes patience.
     """
 
     fraction: float = 1.0
     ends_behind: bool = False
     loses_forces: bool = False
+    is_deep: bool = False
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,8 @@ class StepController:
         self.leaps += 1
         # a longer step may pass a singular tangent
         leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
-        self.step = 2 * plan.length if leaps_over else plan.length / 2
+        length = plan.length * plan.event.fraction  # as it was tried
+        self.step = 2 * length if leaps_over else length / 2
         if not self.step >= smallest:
             raise PathStopped(reason, self.current)
 
