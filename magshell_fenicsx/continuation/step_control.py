@@ -158,8 +158,7 @@ class StepController:
         self.leaps += 1
         # a longer step may pass a singular tangent
         leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
-        length = plan.length * plan.event.fraction  # as it was tried
-        self.step = 2 * length if leaps_over else length / 2
+        self.step = 2 * plan.length if leaps_over else plan.length / 2
         if not self.step >= smallest:
             raise PathStopped(reason, self.current)
 

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 CONTACT_DEPTH = 2e-3
 NEAR_CONTACT = 4.0  # of `CONTACT_DEPTH`: from so near a step leads past the first contact
 MAX_GAP_EVALUATIONS = 40  # on the way of a step
+DEEP_RATIO = 2.0  # penetration at a prediction over that at its point, above which it is deep
 
 
 def first_contact(
@@ -52,16 +53,21 @@ def first_contact(
         contact for contact in scene.model.shell_contacts if isinstance(contact, SurfaceContact)
     ]
     body_contacts = [contact for contact, _ in scene.model.contacts.values()]
+    contacts: list[BodyContact | SurfaceContact] = [*body_contacts, *surface_contacts]
     if surface_contacts:
         begin_displacement, end_displacement = (
             gathered_displacement(scene, state) for state in states
         )
     # part of the way at which the step ends, and whether this is behind a contact
     first_event = 1.0, False
-    loses_forces = False
-    for contact in (*body_contacts, *surface_contacts):
-        if at_begin.evaluate(contact.penetration):  # it touches already: does it come apart?
-            loses_forces |= not at_end.evaluate(contact.penetration)
+    # shells may lie anywhere in each other
+    loses_forces, is_deep = False, bool(scene.model.shell_contacts)
+    for contact in contacts:
+        depth = at_begin.evaluate(contact.penetration)
+        if depth:  # it touches already: does it come apart?
+            depth_at_end = at_end.evaluate(contact.penetration)
+            loses_forces |= not depth_at_end
+            is_deep |= depth_at_end > DEEP_RATIO * depth
             continue
         # it is open: where does it close?
         if isinstance(contact, SurfaceContact):
@@ -72,15 +78,8 @@ def first_contact(
         onset = _onset(way, CONTACT_DEPTH * h) if way else (1.0, False)
         # the earliest; of equal ones that behind a contact
         first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
-    # behind a contact the prediction is deeper than a body's bound, and shells may lie anywhere
     part, is_behind = first_event
-    is_deep = is_behind or bool(scene.model.shell_contacts)
-    if part == 1.0 and not is_deep:
-        is_deep = any(
-            at_end.evaluate(contact.penetration) > contact.contact.max_penetration * h
-            for contact in body_contacts
-        )
-    return StepEvent(part, is_behind, loses_forces, is_deep)
+    return StepEvent(part, is_behind, loses_forces, is_deep or is_behind)
 
 
 @dataclass(frozen=True)
