@@ -488,7 +488,8 @@ class BodyContact:
     @property
     def comm(self) -> MPI.Comm:
         """The communicator of the mesh."""
-        return self._u.function_space.mesh.comm
+        comm: MPI.Comm = self._u.function_space.mesh.comm
+        return comm
 
     def penetration(self) -> float:
         """Return the largest penetration over R, 0 without contact; collective."""
