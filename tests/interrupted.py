@@ -25,7 +25,8 @@ def start(*arguments: str | Path, ranks: int = 0, size_limit: int = 0) -> subpro
         limit = f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size_limit}, {size_limit}))"
         program = [
             "-c",
-            f"import resource\nfrom mpi4py import MPI\n{limit}\nimport magshell_fenicsx.__main__",
+            f"import resource\nfrom mpi4py import MPI\n{limit}\n"
+            "from magshell_fenicsx.__main__ import main\nmain()",
         ]
     command = [*launcher, sys.executable, *program, *map(str, arguments)]
     # mpirun loses lines of stderr where stdout is /dev/null

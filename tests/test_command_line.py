@@ -174,6 +174,25 @@ cli.main()
     assert (done.returncode, done.stderr) == (130, "")
 
 
+def test_an_interrupt_while_the_program_is_imported() -> None:
+    """It ends at once, as after any other interrupt."""
+    program = """
+import signal, sys
+from magshell_fenicsx.__main__ import main
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "typer":
+            signal.raise_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job ignores it
+sys.meta_path.insert(0, Interrupting())
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def test_missing_file_and_no_case() -> None:
     done = magshell("run", "nowhere.yaml")
     assert (done.returncode, done.stderr) == (

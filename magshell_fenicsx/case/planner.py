@@ -70,6 +70,7 @@ from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import ChartOfPlace
+from magshell_fenicsx.parts.supports.boundary import inflation_warning
 from magshell_fenicsx.problem.columns import refuse_duplicate_names
 from magshell_fenicsx.problem.formulas import (
     PlacedFormulas,
@@ -912,6 +913,10 @@ def _warnings(case: Case, places: Array) -> tuple[str, ...]:
     contributors = case.context.contributors()
     warnings = [contributor.warning(context, places) for contributor, context in contributors]
     warnings.append(_unit_warning(case, places))
+    for member in case.several.parts if case.several else ():
+        own_context = replace(member.case.context, steps=case.context.steps)
+        warning = inflation_warning(own_context, member.name)
+        warnings.append(warning and member.refused(warning))
     return tuple(warning for warning in warnings if warning)
 
 

@@ -174,14 +174,16 @@ class BorderedNewton:
             solve.
         max_step
             A longer step, in lengths, ends the solve early. If it is finite, steps that lead astray
-            end the solve early too: a shorter step of the path then costs less.
+            end the solve early too, and nothing else is tried: a shorter step of the path then
+            costs less.
         """
         options = SolveOptions(stress, reuse_distance, max_step)
         result = self._run_snes(self._full_steps, guess, name, row, options)
         # rounding hides the solution whatever the steps
         if result.converged or result.reason == HIDDEN_BY_ROUNDING:
             return result
-        if not (search and self._line_search):
+        is_patient = search and max_step == np.inf
+        if not (is_patient and self._line_search):
             return result
         # soft faces that become harder, then a line search
         second_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(

@@ -46,7 +46,7 @@ from magshell_fenicsx.continuation.point import (
     SolverJournal,
     StepOptions,
 )
-from magshell_fenicsx.continuation.snes import DIVERGED, GUESS_TOO_FAR
+from magshell_fenicsx.continuation.snes import GUESS_TOO_FAR
 from magshell_fenicsx.continuation.step_control import (
     MIN_FRACTION_BEFORE_FOLD,
     PREDICTOR_POINTS,
@@ -87,9 +87,6 @@ MAX_ESTIMATE_CORRECTION = 0.01  # in lengths: the single correction of an estima
 # one path
 MAX_DISTANCE_RATIO = 3.0
 ZERO_DISPLACEMENT = 1e-6  # in lengths: smaller displacements count as zero
-# in arc length, to which steps shrink before a first touch: from deeper inside a hard body the
-# correction is led astray
-MIN_STEP_BEFORE_TOUCH = 1e-6
 
 
 class NotANumber(RuntimeError):
@@ -566,7 +563,7 @@ class Path:
                     controller.rejected = None if passes_kinks else result
                     result = self.as_base(result.point) if passes_kinks else result.reason
                 if isinstance(result, str):
-                    controller.reject_step(plan, result, self._smallest_step(result))
+                    controller.reject_step(plan, result, self.options.smallest)
                     continue
                 # the step is accepted; a point that was rejected earlier may follow at once
                 straight = self._cosine(current, result) > self.options.growth_cosine
@@ -611,7 +608,7 @@ class Path:
         predictors = points[-3:] if takes_quintic else points[-2:]
         s = step_end(s, predictors)
         # the onset of forces on the way, unless no solution was found behind it before
-        event = StepEvent()
+        event = StepEvent(is_deep=self._step_event is not None)
         if current is not controller.onset_without_solution:
             event = self._event(current.state, self.predicted_state(s, predictors))
         # where forces are lost, earlier points mislead: the tangent at the current point alone
@@ -630,13 +627,15 @@ class Path:
         -------
         The next point, a rejected point that is too far away, or the reason why there is none.
         """
-        result, event = self._try_step(plan.s, plan.predictors), plan.event
+        event = plan.event
+        result = self._try_step(plan.s, plan.predictors, is_deep=event.is_deep)
         if event.fraction < 1 and not event.ends_behind:  # it ends just before an onset of forces
             return self._checked_before_onset(current, result)
         # behind an onset the load may turn back: arc length along the displacement still grows
         arc_has_failed = self.control == "arc" and not isinstance(result, Point)
         if event.ends_behind and arc_has_failed:
-            return self._try_step(plan.s, [self._measured_along_displacement(current)])
+            across = [self._measured_along_displacement(current)]
+            return self._try_step(plan.s, across, is_deep=event.is_deep)
         return result
 
     def _retry(self, controller: StepController, rejected: RejectedPoint, sense: float) -> bool:
@@ -769,13 +768,17 @@ class Path:
             mu += value_weight * mu_change + slope_weight * point.dmu
         return last_state.with_(u, name, float(mu))
 
-    def _try_step(self, s: float, predictors: Sequence[Point]) -> Point | RejectedPoint | str:
+    def _try_step(
+        self, s: float, predictors: Sequence[Point], *, is_deep: bool
+    ) -> Point | RejectedPoint | str:
         """Predict and correct the point at `s`.
 
         Parameters
         ----------
         predictors
             Points of which the last is the current one; the polynomial through them is the guess.
+        is_deep
+            Whether faces may lie deep in each other at the guess.
 
         Returns
         -------
@@ -785,10 +788,10 @@ class Path:
         current = predictors[-1]
         self.progress.trying(current, s - current.s)
         guess = self.predicted_state(s, predictors)
-        # a solve with long steps is given up, but not where forces begin within a step: there the
-        # steps of a solve may grow before they shrink
+        # a solve with long steps is given up, but not from deep in a contact: there the steps of a
+        # solve may grow before they shrink
         max_step = np.inf
-        if not self.newton.options.has_onsets:
+        if not is_deep:
             distance = max_abs(self.system.comm, guess.u - current.state.u) / self.system.length
             max_step = max(MAX_CORRECTION * distance, MIN_CORRECTION_LIMIT)
         point = self.correct(s, guess, current, max_step=max_step)
@@ -877,22 +880,11 @@ class Path:
         # only for the shortest step: others are tried again at half their length
         if plan.length / 2 >= self.options.smallest or self.control != "arc":
             return False
-        if not self.newton.options.allows_kinks or rejected.reason != SHARP_TURN:
+        if not self.newton.options.has_onsets or rejected.reason != SHARP_TURN:
             return False
         if rejected.point.has_instability_since(current):
             return False
         return not self.are_apart(current, self.relative_to(current, rejected.point))
-
-    def _smallest_step(self, reason: str) -> float:
-        """Return the smallest length of a step in s, after a failure for a reason.
-
-        By arc length it is less than `StepOptions.smallest` where a body may be just ahead.
-        """
-        is_astray = reason in (GUESS_TOO_FAR, DIVERGED) and self.newton.options.allows_kinks
-        smallest = self.options.smallest
-        if is_astray and self.control == "arc":
-            return min(smallest, MIN_STEP_BEFORE_TOUCH)
-        return smallest
 
     def are_apart(self, low: Point, high: Point, rounding: float = ZERO_DISPLACEMENT) -> bool:
         """Return whether two points lie too far apart for one path, given their tangents.

@@ -95,9 +95,6 @@ class NewtonOptions:
     stiffnesses
         Amplitudes that are the stiffness of faces between which contact forces begin within a step,
         with their values in a state that has none.
-    allows_kinks
-        Whether a path has kinks although full steps do not circle, as where points of rigid bodies
-        touch.
     """
 
     tolerance: float = 1e-9
@@ -109,7 +106,6 @@ class NewtonOptions:
     largest_step: float = 1e4
     patience: int = 4
     stiffnesses: Mapping[str, float] = field(default_factory=dict)
-    allows_kinks: bool = False
 
     @property
     def has_onsets(self) -> bool:

@@ -34,11 +34,14 @@ class StepEvent:
     loses_forces
         Whether forces of the point are lost at the prediction: then only the tangent at the point
         predicts the next one.
+    is_deep
+        Whether faces may lie deep in each other at the prediction: its correction takes patience.
     """
 
     fraction: float = 1.0
     ends_behind: bool = False
     loses_forces: bool = False
+    is_deep: bool = False
 
 
 @dataclass(frozen=True)

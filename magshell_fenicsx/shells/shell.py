@@ -28,6 +28,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
 from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, EdgePressure, triangle_sides
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
+from magshell_fenicsx.continuation.system import Amplitudes
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import (
     SECOND_SYMMETRY_EDGE,
@@ -82,6 +83,7 @@ from magshell_fenicsx.parts.supports.support_motion import (
 )
 from magshell_fenicsx.parts.supports.supports import (
     closing_point,
+    free_motion,
     put_in_plane,
     refuse_unknown,
 )
@@ -614,6 +616,17 @@ class ShellModel(ThinModel):
         if not facets:
             return np.empty(0, np.int32)
         return np.unique(np.concatenate(facets)).astype(np.int32)
+
+    def free_motion(self, amplitudes: Amplitudes) -> str:
+        """Return a message that names a rigid motion left free; "" if there is none; collective.
+
+        A half has motions that are antisymmetric to its plane too, as about a point that is held
+        there: its own system does not see them.
+        """
+        message, modes = super().free_motion(amplitudes), self.symmetry_breaking_modes
+        if message or not isinstance(modes, AntisymmetricModes):
+            return message
+        return free_motion(modes.system, self.r0, amplitudes)
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | SectorModes | None:

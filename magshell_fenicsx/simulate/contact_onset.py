@@ -1,4 +1,4 @@
-"""First contact between shells on the way to a predicted state.
+"""First contact between shells, or with a body, on the way to a predicted state.
 
 A prediction from before a contact knows nothing of it: shells would overlap deeply, and Newton's
 method would not converge. So a step ends just before the first contact, and the next one just
@@ -10,12 +10,15 @@ faces, negative where they overlap.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.bodies.body_contact import BodyContact
 from magshell_fenicsx.parts.contact.surface_contact import CROSSING_DISTANCE, SurfaceContact
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -24,16 +27,17 @@ Array = NDArray[np.float64]
 CONTACT_DEPTH = 2e-3
 NEAR_CONTACT = 4.0  # of `CONTACT_DEPTH`: from so near a step leads past the first contact
 MAX_GAP_EVALUATIONS = 40  # on the way of a step
+DEEP_RATIO = 2.0  # penetration at a prediction over that at its point, above which it is deep
 
 
 def first_contact(
     scene: Scene, leave: Callable[[State], State], here: State, prediction: State
 ) -> StepEvent:
-    """Return where shells that are apart first meet on the way of a step; collective.
+    """Return where shells, or a shell and a body, that are apart first meet on the way of a step.
 
     The way between the two states is straight. The step ends just behind the contact if the first
-    state is near it, else just before. The event also says whether a pair that touches at the begin
-    comes apart.
+    state is near it, else just before. The event also says whether a contact that is closed at the
+    begin opens. Collective.
 
     Parameters
     ----------
@@ -42,26 +46,94 @@ def first_contact(
     here, prediction
         States of the step's system at both ends of the step.
     """
-    # contacts of surfaces alone: steps of a meridian do without this
-    contacts = [
+    states, h = (leave(here), leave(prediction)), scene.problem.material.h
+    at_begin, at_end = map(scene.model.system.at_state, states)
+    # contacts of surfaces alone: steps on which meridians meet do without this
+    surface_contacts = [
         contact for contact in scene.model.shell_contacts if isinstance(contact, SurfaceContact)
     ]
-    if not contacts:
-        return StepEvent()
-    states = leave(here), leave(prediction)
-    at_begin, at_end = map(scene.model.system.at_state, states)
-    begin_displacement, end_displacement = (gathered_displacement(scene, state) for state in states)
+    body_contacts = [contact for contact, _ in scene.model.contacts.values()]
+    contacts: list[BodyContact | SurfaceContact] = [*body_contacts, *surface_contacts]
+    if surface_contacts:
+        begin_displacement, end_displacement = (
+            gathered_displacement(scene, state) for state in states
+        )
     # part of the way at which the step ends, and whether this is behind a contact
     first_event = 1.0, False
-    loses_forces = False
+    # shells may lie anywhere in each other
+    loses_forces, is_deep = False, bool(scene.model.shell_contacts)
     for contact in contacts:
-        if at_begin.evaluate(contact.penetration):  # it touches already: does it come apart?
-            loses_forces |= not at_end.evaluate(contact.penetration)
-        else:  # it is open: where does it close?
-            onset = _onset(contact, scene.problem.material.h, begin_displacement, end_displacement)
-            # the earliest; of equal ones that behind a contact
-            first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
-    return StepEvent(*first_event, loses_forces)
+        depth = at_begin.evaluate(contact.penetration)
+        if depth:  # it touches already: does it come apart?
+            depth_at_end = at_end.evaluate(contact.penetration)
+            loses_forces |= not depth_at_end
+            is_deep |= depth_at_end > DEEP_RATIO * depth
+            continue
+        # it is open: where does it close?
+        if isinstance(contact, SurfaceContact):
+            way = _way_of_surfaces(contact, begin_displacement, end_displacement)
+        else:
+            places = at_begin.evaluate(contact.places), at_end.evaluate(contact.places)
+            way = _way_beside_body(contact, *places, CROSSING_DISTANCE * h)
+        onset = _onset(way, CONTACT_DEPTH * h) if way else (1.0, False)
+        # the earliest; of equal ones that behind a contact
+        first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
+    part, is_behind = first_event
+    return StepEvent(part, is_behind, loses_forces, is_deep or is_behind)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """The straight way of a step, for one contact; lengths are over R.
+
+    Attributes
+    ----------
+    gap
+        Part of the way -> least gap there; collective.
+    largest_approach
+        Upper bound of the distance by which the gap closes on the whole way.
+    crossing_distance
+        Overlap up to which no face has passed through another one, or through a body.
+    """
+
+    gap: Callable[[float], float]
+    largest_approach: float
+    crossing_distance: float
+
+
+def _way_of_surfaces(contact: SurfaceContact, u: Array, v: Array) -> _Way | None:
+    """Return the way between two displacements (nodes, 3) of all ranks; None if shells stay apart.
+
+    Collective.
+    """
+    # two nodes come nearer to each other by at most twice the largest displacement
+    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())
+    if not largest_approach or not contact.come_near(u, v):
+        return None
+
+    def gap(part: float) -> float:
+        """Return the least gap after a part of the way."""
+        return contact.gap(u + part * (v - u))
+
+    return _Way(gap, largest_approach, CROSSING_DISTANCE * contact.least_thickness())
+
+
+def _way_beside_body(
+    contact: BodyContact, x: Array, y: Array, crossing_distance: float
+) -> _Way | None:
+    """Return the way between places (points, 3) relative to a body; None if nothing moves.
+
+    The places are those of quadrature points of this rank. Collective.
+    """
+    largest_approach = contact.comm.allreduce(
+        float(np.linalg.norm(y - x, axis=1).max(initial=0.0)), MPI.MAX
+    )
+
+    def gap(part: float) -> float:
+        """Return the least gap after a part of the way."""
+        return contact.least_gap(x + part * (y - x))
+
+    return _Way(gap, largest_approach, crossing_distance) if largest_approach else None
 
 
 def gathered_displacement(scene: Scene, state: State) -> Array:
@@ -73,46 +145,36 @@ def gathered_displacement(scene: Scene, state: State) -> Array:
     return np.asarray(np.concatenate(displacements_of_ranks).reshape(-1, 3))
 
 
-def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float, bool]:
-    """Return where a step between two displacements ends for a contact that is open; collective.
+def _onset(way: _Way, depth: float) -> tuple[float, bool]:
+    """Return where a step on a way ends for a contact that is open; collective.
 
     The gap is evaluated on the way, first in steps so short that no face passes through another
     one. Then a bracket of the contact is divided by interpolation.
 
     Parameters
     ----------
-    h
-        Thickness over R.
-    u, v
-        Displacements (nodes, 3) of all ranks at both ends of the step.
+    depth
+        How far before and past the first contact the two steps end, over R.
 
     Returns
     -------
     part, is_behind
         The part of the way, 1 without a contact; and whether the step ends behind the contact.
     """
-    # two nodes come nearer to each other by at most twice the largest displacement
-    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())
-    depth = CONTACT_DEPTH * h
-    if not largest_approach or not contact.come_near(u, v):
-        return 1.0, False
-    gap_at_low = contact.gap(u)
+    gap_at_low = way.gap(0.0)
     if gap_at_low <= 0:
         return 1.0, False
     # from near the contact the step ends behind it, at the gap -depth, else before it, at +depth
     is_behind = gap_at_low < NEAR_CONTACT * depth
     aimed_gap = -depth if is_behind else depth
-    least_thickness = contact.least_thickness()
     # bracket: parts of the way before and behind the aimed gap. high is 0 while it is not known
     low, high, gap_at_high = 0.0, 0.0, 0.0
     for _ in range(MAX_GAP_EVALUATIONS):
         if high:  # linear interpolation of the gap
             part = low + (high - low) * (gap_at_low - aimed_gap) / (gap_at_low - gap_at_high)
         else:  # so far no face can pass through another one
-            part = min(
-                1.0, low + (gap_at_low + CROSSING_DISTANCE * least_thickness) / largest_approach
-            )
-        gap = contact.gap(u + part * (v - u))
+            part = min(1.0, low + (gap_at_low + way.crossing_distance) / way.largest_approach)
+        gap = way.gap(part)
         if gap < aimed_gap - depth:  # too far
             high, gap_at_high = part, gap
         elif gap <= aimed_gap + depth:  # exact enough

@@ -264,14 +264,13 @@ class Scene:
     def _newton_options(self) -> NewtonOptions | None:
         """Return the options of the solver of a model with contact; None (the default) without."""
         pairs = [contact.pair for contact in self.model.shell_contacts]
-        stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
-        if not (self.model.contacts or stiffnesses):
+        penalties = [*pairs, *self.problem.loads.contacts]
+        stiffnesses = {penalty.setting: penalty.stiffness for penalty in penalties}
+        if not stiffnesses:
             return None
         # A penetration changes over far less than h. So factors of a near-by state are of no use.
         # The first iterations only find out what touches, and the solver must have patience.
-        return NewtonOptions(
-            reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
-        )
+        return NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses=stiffnesses)
 
     def with_field_strength(self, context: Context) -> "Scene":
         """Return the scene of a case that differs by the strength of the field alone.

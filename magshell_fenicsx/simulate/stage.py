@@ -127,7 +127,8 @@ class Stage:
             _refuse_open(self.scene, name)
         scene = self.scene
         arguments = self.newton, name, control, options, scale, scene.journal, scene.progress
-        if scene.model.shell_contacts:  # steps end where shells first touch
+        # steps end where shells, or a shell and a body, first touch
+        if scene.model.shell_contacts or scene.model.contacts:
             return Path(*arguments, partial(first_contact, scene, self.leave))
         return Path(*arguments)
 

@@ -85,3 +85,22 @@ def test_warning_of_the_layer(rim: str, law: Mapping[str, Any], warned: bool) ->
     warnings = make_problem(Case.from_source(case)).warnings
     layer = "boundary.rim: clamped: blown-up rubber bends there in a layer"
     assert any(warning.startswith(layer) for warning in warnings) == warned
+
+
+def test_warning_of_the_layer_of_several_shells() -> None:
+    """Each shell of rubber that a pressure blows up at a clamped rim has one; others have none."""
+    sizes = {"radius": "50 mm", "thickness": "0.5 mm", "youngs_modulus": "1 MPa"}
+    shell = {"geometry": "disc", **sizes}
+    rubber = {"shell": shell | {"poisson_ratio": 0.5} | RUBBER, "boundary": {"rim": "clamped"}}
+    stiff = {"shell": shell | {"poisson_ratio": 0.3}, "boundary": {"rim": "clamped"}}
+    shells = {
+        name: member | {"place": {"position": ["0 mm", "0 mm", f"{100 * z} mm"]}}
+        for z, (name, member) in enumerate(
+            {"pressed": rubber, "aside": rubber, "stiff": stiff}.items()
+        )
+    }
+    on = {"pressed": "inside", "stiff": "inside"}
+    loading = {"kind": "pressure", "control": "arc", "until": "target", "pressure": 0.1, "on": on}
+    problem = make_problem(Case.from_source({"shells": shells, "loading": loading}))
+    warned = [warning for warning in problem.warnings if "blown-up rubber" in warning]
+    assert [warning.split(":")[0] for warning in warned] == ["shells.pressed.boundary.rim"]

@@ -64,7 +64,7 @@ def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
     alone = first_contact(stack, lambda state: state, lifted(stack), guess)
     assert (alone.fraction, alone.loses_forces) == (ahead.fraction, False)
     assert first_contact(stack, lambda state: state, here, lifted(stack)) == StepEvent(
-        loses_forces=True
+        loses_forces=True, is_deep=True
     )
 
 

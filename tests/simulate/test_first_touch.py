@@ -1,4 +1,4 @@
-"""A dead load presses a cap onto a ball by arc length: the load goes on where the shell is held."""
+"""Shells that meet a body: loads go on where they are held, and no path creeps."""
 
 from typing import Any
 
@@ -49,3 +49,59 @@ def test_a_load_goes_on_at_a_ball(hole: float) -> None:
     unit = 2 * np.pi * h**3 / 12 / (1 - 0.3**2)
     assert unit * end["force"] == pytest.approx(LOAD - before, rel=0.02)
     assert len(passed) < 60, "it does not creep"
+
+
+STRIP: dict[str, Any] = {
+    "shell": {
+        "geometry": "strip", "radius": "20 mm", "width": "4 mm", "thickness": "0.4 mm",
+        "youngs_modulus": "1 MPa", "poisson_ratio": 0,
+    },
+    "boundary": {"root": "clamped"},
+    "bodies": {
+        "bar": {
+            "kind": "cylinder", "radius": "4 mm", "axis": [0, 1, 0],
+            "position": ["12 mm", "0 mm", "-7 mm"], "direction": [0, 0, 1],
+        }
+    },
+    "magnetic": {
+        "remanent": {"polar": 90, "flux_density": "100 mT"},
+        "applied": {"polar": 180, "flux_density": "2 mT"},
+    },
+    "mesh": {"degree": 3, "refinement": 0.6},
+    "loading": {"kind": "field", "until": "target", "points": 2},
+}  # fmt: skip
+
+
+def test_a_field_bends_a_strip_onto_a_bar() -> None:
+    """Its line of contact moves over the points of the mesh: they meet the bar and leave it again,
+    and the path is no longer than the field needs.
+    """
+    scene = Scene(Case.from_source(STRIP))
+    passed = [(record.label, scene.observe(record.point.state)) for record in follow(scene)]
+    *_, (label, end) = passed
+    assert label == "target"
+    assert end["force"] > 0
+    assert 0 < end["penetration_over_h"] < 1e-3
+    assert len(passed) < 40, "it does not creep"
+
+
+ARCH: dict[str, Any] = {
+    "shell": {
+        "geometry": "cylinder", "radius": 1, "length": 0.12, "thickness": h, "youngs_modulus": 1,
+        "poisson_ratio": 0, "azimuth": [0, 180],
+    },
+    "boundary": {"left": "clamped", "right": "clamped", "bottom": "symmetry", "top": "symmetry"},
+    "bodies": {"plate": {"kind": "plane", "at": {"point": [0, 1, 0.06]}}},
+    "mesh": {"degree": 4, "size": 0.24},
+    "loading": {"kind": "contact", "approach": 8, "points": 4},
+}  # fmt: skip
+
+
+def test_a_plate_flattens_half_a_ring() -> None:
+    """Two lines of contact move apart over the points of the mesh."""
+    scene = Scene(Case.from_source(ARCH))
+    passed = [(record.label, scene.observe(record.point.state)) for record in follow(scene)]
+    forces = [seen["force"] for label, seen in passed if label == "target"]
+    assert len(forces) == 4
+    assert np.all(np.diff(forces) > 0)
+    assert len(passed) < 30, "it does not creep"

@@ -485,6 +485,28 @@ class BodyContact:
         gaps, *_ = self._gap_memo.renew()
         return gaps
 
+    @property
+    def comm(self) -> MPI.Comm:
+        """The communicator of the mesh."""
+        comm: MPI.Comm = self._u.function_space.mesh.comm
+        return comm
+
+    def penetration(self) -> float:
+        """Return the largest penetration over R, 0 without contact; collective."""
+        return float(self.comm.allreduce(float((-self.gap).max(initial=0.0)), MPI.MAX))
+
+    def places(self) -> Array:
+        """Return the places (points, 3) over R of the points relative to the body."""
+        return np.asarray((self._placement_memo.renew() + self.place).reshape(-1, 3))
+
+    def least_gap(self, places: Array) -> float:
+        """Return the least gap over R at places (points, 3) relative to the body; collective.
+
+        The thickness is the present one.
+        """
+        gaps, _, _ = self.contact.gap(places, approach=0.0, half=self._h / 2 * self.factor)
+        return float(self.comm.allreduce(float(gaps.min(initial=np.inf)), MPI.MIN))
+
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
         """Return the gap (points,), its gradient (points, 3) and its Hessian (points, 3, 3).
 

@@ -94,17 +94,10 @@ class BoundarySection(Section, Ability):
     def warning(self, context: Context, places: Array) -> str | None:
         """Return a warning if pressure blows up rubber beside a clamped edge; None if not.
 
-        Several shells are not looked at. `places` are not used here.
+        Of several shells each has a warning of its own. `places` are not used here.
         """
-        edges = edges_of_inflated_rubber(context)
-        if not edges or getattr(context.shell, "assembly", None) is not None:
-            return None
-        return (
-            f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
-            "is thick, which no shell theory describes: instabilities may be false far beyond the "
-            "largest pressure, or with wider elements along this edge; hinged is right, and a "
-            "clamped edge raises the fold by less than h/R"
-        )
+        is_one_shell = getattr(context.shell, "assembly", None) is None
+        return inflation_warning(context) if is_one_shell else None
 
     def refuse_unfit(self, context: Context) -> None:
         """Refuse names of points that are taken, and of edges that the geometry does not have.
@@ -207,24 +200,60 @@ def refuse_taken(points: Iterable[str]) -> None:
             )
 
 
-def edges_of_inflated_rubber(context: Context) -> list[str]:
+def inflation_warning(context: Context, shell: str = "") -> str | None:
+    """Return a warning if pressure blows up a shell of rubber beside a clamped edge; None if not.
+
+    Parameters
+    ----------
+    context
+        The case of the shell alone, with the steps of the whole case.
+    shell
+        Its name among several shells; "" for a single one.
+    """
+    edges = edges_of_inflated_rubber(context, shell)
+    if not edges:
+        return None
+    return (
+        f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
+        "is thick, which no shell theory describes: instabilities may be false far beyond the "
+        "largest pressure, or with wider elements along this edge; hinged is right, and a "
+        "clamped edge raises the fold by less than h/R"
+    )
+
+
+def edges_of_inflated_rubber(context: Context, shell: str = "") -> list[str]:
     """Return names of clamped edges at which inflated rubber bends in a narrow layer.
 
     There are none in a solid, and in a shell so thin that the layer counts less than the mesh.
+
+    Parameters
+    ----------
+    context
+        The case of one shell.
+    shell
+        Its name among several shells; "" for a single one.
     """
-    shell, boundary = context.shell, context.section_of(BoundarySection)
-    if boundary is None or context.solid or not shell.law_section.incompressible:
+    section, boundary = context.shell, context.section_of(BoundarySection)
+    if boundary is None or context.solid or not section.law_section.incompressible:
         return []
-    is_flat = shell.geometry in FLAT_GEOMETRIES
-    inflated = any(_inflates(step.load, is_flat=is_flat) for step in context.steps)
-    if not inflated or shell.R_over_h > THIN_RUBBER:
+    is_flat = section.geometry in FLAT_GEOMETRIES
+    inflated = any(_inflates(step.load, shell, is_flat=is_flat) for step in context.steps)
+    if not inflated or section.R_over_h > THIN_RUBBER:
         return []
     return [name for name, condition in boundary.conditions().items() if condition == "clamped"]
 
 
-def _inflates(load: Any, *, is_flat: bool) -> bool:
-    """Return whether the load of a step blows up a shell: from inside, or a flat one at all."""
+def _inflates(load: Any, shell: str, *, is_flat: bool) -> bool:
+    """Return whether the load of a step blows up a shell: from inside, or a flat one at all.
+
+    `shell` is its name among several, of which a load may press some alone; else "".
+    """
     if load.kind != "pressure":
         return False
+    faces = load.on or {}
+    if shell and faces:
+        if shell not in faces:
+            return False
+        faces = {shell: faces[shell]}
     pressures_from_inside = [-(load.pressure or 0.0), load.volume_change or 0.0]
-    return is_flat or max(pressures_from_inside) > 0 or "inside" in (load.on or {}).values()
+    return is_flat or max(pressures_from_inside) > 0 or "inside" in faces.values()

@@ -50,6 +50,21 @@ def test_loose(shell: dict[str, Any], boundary: dict[str, Any], motion: str) -> 
         scene(shell, boundary, CORNERS if shell is PLATE else {})
 
 
+def test_a_half_of_a_ring_that_turns_about_its_point() -> None:
+    """It turns within the planes of its edges, which the half cannot, and the ring can."""
+    ring = CYLINDER | {"length": 0.2, "youngs_modulus": 1}
+    edges = {"bottom": "symmetry", "top": "symmetry"}
+    points = {"east": [1, 0, 0], "west": [-1, 0, 0]}
+    pressed = {"kind": "dead", "loads": [{"at": "west", "force": [1, 0, 0]}], "factor": 1e-6}
+    case = {"shell": ring, "points": points, "loading": pressed, "symmetry": "half"}
+    case["mesh"] = {"degree": 2, "size": 0.5}
+    at_one_point = edges | {"east": {"held": ["x", "y", "z"]}}
+    with pytest.raises(MeshError, match="boundary: the shell is not held: it is free to"):
+        Scene(Case.from_source(case | {"boundary": at_one_point}))
+    at_two_points = at_one_point | {"west": {"held": ["y"]}}
+    assert Scene(Case.from_source(case | {"boundary": at_two_points})).newton
+
+
 @pytest.mark.parametrize(
     ("shell", "boundary"),
     [
