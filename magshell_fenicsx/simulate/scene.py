@@ -19,7 +19,6 @@ Words and symbols:
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from math import copysign, nan
 from typing import TYPE_CHECKING, Any
@@ -43,8 +42,6 @@ from magshell_fenicsx.mesh.mirror import Y0_PLANE, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
-from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.observables import ModelView
 from magshell_fenicsx.parts.registered import OBSERVABLES
@@ -274,35 +271,7 @@ class Scene:
             reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
         )
 
-    def with_field_strength(self, context: Context) -> "Scene":
-        """Return the scene of a case that differs by the strength of the field alone.
-
-        It has the same model and solver. Neither is built again.
-
-        Parameters
-        ----------
-        context
-            What the sections of the other case have made of its file.
-        """
-        return self._copy(
-            problem=replace(self.problem, context=context, lambda_m=strength(context))
-        )
-
-    def with_model(self, problem: Problem, model: MeridianModel) -> "Scene":
-        """Return the scene of a problem that differs in numbers alone, with a model that has them.
-
-        The solver has the options of this scene's solver.
-
-        Parameters
-        ----------
-        problem, model
-            The other problem, and its model on the same mesh.
-        """
-        return self._copy(
-            problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
-        )
-
-    def _copy(self, **changes: Any) -> "Scene":
+    def copied(self, **changes: Any) -> "Scene":
         """Return a copy with changed attributes; cached properties are computed anew.
 
         Parameters
