@@ -1,12 +1,12 @@
-"""Perturbation of a number of a problem: its scene on the same mesh, for differences.
+"""Perturbation of a number of a problem, for differences of two scenes on the same mesh.
 
 The problem is the one that a file with this number would give: lengths with units stay, those over
-h or in the unit of a dimple's width change with these.
+h or in the unit of a dimple's width change with these. States get its loads, and contact stays in
+the same places.
 
 A key is the path of a number in the case's file, such as "magnetic.remanent.polar"; a section is a
-part of the file. The chart has the coordinates of the undeformed surface; r0 maps it into space.
-Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`; lambda_m is the
-strength of the magnetic field. A rim is the edge of a dimple.
+part of the file. Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`;
+lambda_m is the strength of the magnetic field.
 """
 
 from collections.abc import Collection, Sequence

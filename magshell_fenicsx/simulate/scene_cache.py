@@ -118,8 +118,9 @@ class SceneCache:
 
     @property
     def _unknowns(self) -> int:
-        """Number of unknowns of all scenes that are remembered, on this rank."""
-        return sum(scene.newton.system.size for scene in self._scenes.values())
+        """Number of unknowns of all scenes that are remembered, on all ranks."""
+        dofmaps = (scene.model.V.dofmap for scene in self._scenes.values())
+        return sum(dofmap.index_map.size_global * dofmap.bs for dofmap in dofmaps)
 
     def scene_for(self, problem: Problem) -> Scene:
         """Return the scene of a problem, with what it can take from an earlier one; collective.
