@@ -161,7 +161,7 @@ def _of_shells(scene: Scene, field: Magnetisation, count: int) -> dict[str, Mask
     if model.axisymmetric:
         patches = model.meridian.patches
     masks, rest = dict[str, Mask](), np.ones(count, dtype=bool)
-    for name in reversed(field.patches or ()):
+    for name in reversed(list(field.patches or ())):
         masks[name] = rest & patches[name][:count]
         rest = rest & ~masks[name]
     return dict(reversed(masks.items()))

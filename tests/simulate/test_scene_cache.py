@@ -12,6 +12,7 @@ from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.problem.problem import Document, Problem
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
 from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh, update_fields
 
 STRIP = """
@@ -92,7 +93,7 @@ def test_known_values_have_their_scene() -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
     cache, made = SceneCache(base=Scene(case), max_unknowns=0), list[float]()
 
-    def at(ratio: float) -> Scene:
+    def at(ratio: float) -> SceneOfProblem:
         def problem() -> Problem:
             made.append(ratio)
             return case.problem().with_values({"shell.poisson_ratio": ratio})

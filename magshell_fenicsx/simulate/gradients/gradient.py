@@ -99,13 +99,13 @@ def by_number(adjoint: Adjoint, key: str, scenes: SceneCache | None = None) -> f
     CaseError
         If the number has no derivative here.
     """
-    scene, scenes = adjoint.scene, scenes or SceneCache(base=adjoint.scene)
+    scene, scene_cache = adjoint.scene, scenes or SceneCache(base=adjoint.scene)
     value = number_at_key(scene.problem.context, key)
     _refuse_shell_number(adjoint, key)
 
     def contracted(p: float) -> float:
         """Return J plus equations times multipliers, at fixed states, for a value of the number."""
-        other = scene if p == value else perturbed_scene(scenes, key, p)
+        other = scene if p == value else perturbed_scene(scene_cache, key, p)
         return _contracted_equations(adjoint, other)
 
     return _slope(contracted, value, scale_at_key(scene.problem.context, key))
