@@ -139,7 +139,8 @@ def _of_rims(problem: Problem, centres: Array) -> dict[str, Mask]:
     centres
         Centres (cells, 3) of the cells, of which each is within a rim or outside of it.
     """
-    masks, rest = dict[str, Mask](), np.ones(len(centres), dtype=bool)
+    masks = dict[str, Mask]()
+    rest: Mask = np.ones(len(centres), dtype=bool)
     for name, is_inside in problem.within.items():
         masks[name] = rest & is_inside(centres)
         rest = rest & ~masks[name]
@@ -156,11 +157,13 @@ def _of_shells(scene: Scene, field: Magnetisation, count: int) -> dict[str, Mask
     count
         Number of this rank's own cells.
     """
-    model = scene.model
-    patches = model.midsurface.patches if model.midsurface else {}
-    if model.axisymmetric:
-        patches = model.meridian.patches
-    masks, rest = dict[str, Mask](), np.ones(count, dtype=bool)
+    model, patches = scene.model, dict[str, Mask]()
+    if model.midsurface:
+        patches |= model.midsurface.patches
+    elif model.axisymmetric:
+        patches |= model.meridian.patches
+    masks = dict[str, Mask]()
+    rest: Mask = np.ones(count, dtype=bool)
     for name in reversed(list(field.patches or ())):
         masks[name] = rest & patches[name][:count]
         rest = rest & ~masks[name]
