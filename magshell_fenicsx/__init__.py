@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
     from magshell_fenicsx.simulate.search import solutions
-    from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+    from magshell_fenicsx.simulate.sensitivity import sensitivities
+    from magshell_fenicsx.simulate.steps import fold_at
     from magshell_fenicsx.simulate.trace import trace
 
 __all__ = [
@@ -105,7 +106,8 @@ _NAMES_OF_MODULES = {
     "simulate.gradients.gradient": "gradient",
     "simulate.record": "Record Stopped",
     "simulate.search": "solutions",
-    "simulate.sensitivity": "fold_at sensitivities",
+    "simulate.sensitivity": "sensitivities",
+    "simulate.steps": "fold_at",
     "simulate.trace": "trace",
 }
 _MODULE_OF_NAME = {

@@ -30,10 +30,10 @@ from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.perturbation import (
     KEYS_WITHOUT_GRADIENT,
     number_at_key,
-    problem_on_mesh_of,
     scale_at_key,
 )
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 
 STEP, LONG = (
     1e-4,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.multi_shell_case import REPLACED_KEYS
 from magshell_fenicsx.case.shells import MemberCase
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
@@ -26,7 +27,7 @@ from magshell_fenicsx.problem.mesh_sizes import MeshSection
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-KEYS_OF_SHELLS = ("shells", "shell", "boundary", "points")  # made of the data of several shells
+KEYS_OF_SHELLS = ("shells", *REPLACED_KEYS)  # made of the data of several shells
 
 
 def open_case(

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from magshell_fenicsx.case.shells import MemberCase, OneOfShells, SeveralShells, Shells
 from magshell_fenicsx.input.section import Section, numbers_with_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.kinds import LAW_KEYS
+from magshell_fenicsx.parts.kinds import LawKeys
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.shell_sections import ShellSection
 
@@ -32,7 +32,7 @@ REPLACED_KEYS = ("shell", "boundary", "points")
 SECTIONS_WITH_NAMES = ("loading", "contact", "joints", "natural", "magnetic")
 FILE_KEYS = ("file", "program")  # their values are no such names
 COMMON_KEYS = ("viscosity", "relaxation")
-KEYS_OF_FIRST = ("law", *LAW_KEYS, *COMMON_KEYS)
+KEYS_OF_FIRST = (*LawKeys.model_fields, *COMMON_KEYS)
 MAX_RATIO = 1e6  # of a modulus or a density to that of the first shell, or the other way round
 FORCE_KEYS = ("at", "patch", "depth")  # keys of a force that mesh sizes follow
 NAME = re.compile(r"[A-Za-z]\w*")

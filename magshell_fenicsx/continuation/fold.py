@@ -416,22 +416,14 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
     )
 
 
-def sensitivity(system: System, fold: Fold, column: Vector) -> float:
-    """Return the derivative of a fold's amplitude by a parameter p: -(l . R_p)/(l . R_mu).
+def residual_multiplier(system: System, fold: Fold) -> Vector:
+    """Return w = -l/(l . R_mu) with the left null vector l of a fold; collective.
 
-    Here l is the left null vector. Collective.
-
-    Parameters
-    ----------
-    system
-        The system at the fold.
-    column
-        R_p at the fold. For another amplitude it is that amplitude's load vector.
+    The amplitude mu of the fold has the derivative w . R_p by a parameter p. For another amplitude
+    R_p is that amplitude's load vector.
     """
     load = system.load(fold.state.u, fold.state.mu, fold.name)
-    return -dot(system.comm, fold.left_null_vector, column) / dot(
-        system.comm, fold.left_null_vector, load
-    )
+    return np.asarray(-fold.left_null_vector / dot(system.comm, fold.left_null_vector, load))
 
 
 def predict_fold(

@@ -53,7 +53,6 @@ Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 
 
 SECTION_BY_KEY = {key: section for section in LAWS.values() for key in section.own_keys()}
-LAW_KEYS = tuple(SECTION_BY_KEY)
 
 
 class LawChoice(Section):

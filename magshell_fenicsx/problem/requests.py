@@ -44,9 +44,6 @@ class FrequenciesSection(Section):
     path.csv"""
 
 
-GRADIENT_FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
-
-
 class GradientsSection(Section):
     """Derivatives of results by numbers and by whole fields, of one adjoint solve for each result.
 

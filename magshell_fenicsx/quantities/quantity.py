@@ -246,6 +246,8 @@ class Quantity:
     each
         Whether there may be several such quantities, each with a column of its own, such as
         approach_ball: the name of this one, an underscore, the name of a body.
+    may_be_nan
+        Whether a run may have no number for it.
     """
 
     name: str
@@ -258,6 +260,7 @@ class Quantity:
     sign: float = 1.0
     stem: str = ""
     each: bool = False
+    may_be_nan: bool = False
 
     @property
     def unit(self) -> str:

@@ -39,9 +39,11 @@ from magshell_fenicsx.quantities.quantity import (
 OWN_MODES = ("", "symmetric", "asymmetric")
 
 
-def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
+def _energy(
+    name: str, words: str, meaning: str, symbol: str = "", *, may_be_nan: bool = False
+) -> Quantity:
     """Return the column of an energy over E h R²."""
-    return Quantity(name, words, meaning, "energy", symbol, (ENERGY,))
+    return Quantity(name, words, meaning, "energy", symbol, (ENERGY,), may_be_nan=may_be_nan)
 
 
 def _w(name: str, note: str, meaning: str) -> Quantity:
@@ -108,7 +110,8 @@ OF_EVERY_RUN = (
         (VOLUME,),
         sign=-1.0,
     ),
-    _energy("energy", "energy", "Π, the sum of all terms."),
+    # a user-defined energy may be no number
+    _energy("energy", "energy", "Π, the sum of all terms.", may_be_nan=True),
     Quantity(
         "negative_pivots",
         "unstable directions",
@@ -125,8 +128,13 @@ OF_EVERY_RUN = (
     Quantity("iterations", "iterations", "Iterations of Newton's method.", "count"),
     Quantity("factorisations", "factorisations", "Factorisations of the tangent.", "count"),
     Quantity("wall_s", "time", "Time since the start of the run.", "time", units=(SECOND_UNIT,)),
-    _energy("stretching", "stretching", "Membrane energy; not of a solid."),
-    _energy("bending", "bending", "Bending energy, including the edges; not of a solid."),
+    _energy("stretching", "stretching", "Membrane energy; not of a solid.", may_be_nan=True),
+    _energy(
+        "bending",
+        "bending",
+        "Bending energy, including the edges; not of a solid.",
+        may_be_nan=True,
+    ),
     _energy("magnetic", "magnetic", "Magnetic energy."),
     _energy("U1", "first term", "First term of the approximate magnetic energies.", "U_1"),
     _energy(

@@ -38,8 +38,11 @@ from magshell_fenicsx.simulate.gradients.instabilities import (
     instabilities,
     refuse_moving,
 )
-from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
-from magshell_fenicsx.simulate.perturbation import refuse_unknown_parameters
+from magshell_fenicsx.simulate.gradients.results import (
+    adjoint_at_end,
+    refuse_no_result,
+    refuse_unknown_parameters,
+)
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]

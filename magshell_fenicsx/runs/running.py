@@ -635,7 +635,8 @@ def _sensitivities(result: Result) -> dict[str, float]:
     step = scene.problem.programme[int(last_row["step"]) - 1]  # steps are numbered from 1
     if not step.load.end.sensitivities:
         return {}
-    from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+    from magshell_fenicsx.simulate.sensitivity import sensitivities
+    from magshell_fenicsx.simulate.steps import fold_at
 
     assert result.path_history.located
     record = result.path_history.located[-1]

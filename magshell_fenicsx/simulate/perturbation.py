@@ -1,44 +1,32 @@
-"""Perturbation of a number of a problem: its scene on the same mesh, for differences.
+"""Perturbation of a number of a problem, for differences of two scenes on the same mesh.
 
 The problem is the one that a file with this number would give: lengths with units stay, those over
-h or in the unit of a dimple's width change with these.
+h or in the unit of a dimple's width change with these. States get its loads, and contact stays in
+the same places.
 
 A key is the path of a number in the case's file, such as "magnetic.remanent.polar"; a section is a
-part of the file. The chart has the coordinates of the undeformed surface; r0 maps it into space.
-Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`; lambda_m is the
-strength of the magnetic field. A rim is the edge of a dimple.
+part of the file. Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`;
+lambda_m is the strength of the magnetic field.
 """
 
-from collections.abc import Collection, Iterable
-from dataclasses import replace
+from collections.abc import Collection, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import is_length
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
-from magshell_fenicsx.parts.kinds import LAW_KEYS
-from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.problem.requests import GRADIENT_FIELDS
+from magshell_fenicsx.parts.kinds import LawKeys
+from magshell_fenicsx.parts.revolution_sections import MaterialSection
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh
 
-Array = NDArray[np.float64]
-MATERIAL_KEYS = (
-    *LAW_KEYS,
-    "density",
-    "laminate",
-    "poisson_ratio",
-    "radius_to_thickness",
-    "thickness",
-    "youngs_modulus",
-    "thickness_factor",
-)
-DEVIATION_KEYS = ("imperfections", "defect")
+# keys of a shell whose numbers change neither its mesh nor its perfect shape
+MATERIAL_KEYS = {*MaterialSection.model_fields, *LawKeys.model_fields, "laminate"}
+DIFFERENTIABLE_KEYS = {*MATERIAL_KEYS, "radius_to_thickness", "imperfections", "defect"}
 KEYS_OUTSIDE_THE_MODEL = (
     "mesh",
     "stability",
@@ -76,8 +64,7 @@ def number_at_key(context: Context, key: str) -> float:
     # shells
     own_key = key.split(".", 2)[2] if key.startswith("shells.") else key
     section_key, _, key_in_section = own_key.partition(".")
-    differentiable_keys = (*MATERIAL_KEYS, *DEVIATION_KEYS)
-    is_geometry = section_key == "shell" and key_in_section.split(".")[0] not in differentiable_keys
+    is_geometry = section_key == "shell" and key_in_section.split(".")[0] not in DIFFERENTIABLE_KEYS
     if section_key in KEYS_WITHOUT_GRADIENT or is_geometry:
         raise CaseError(
             f"{key}: a number of the mesh, of the shape, of a target or of the output has no "
@@ -154,34 +141,13 @@ def _value_and_length(context: Context, key: str) -> tuple[Any, bool]:
     return value, is_length_key
 
 
-def refuse_unknown_parameters(context: Context, names: Iterable[str], start: State) -> None:
-    """Check that gradients can be taken by fields, amplitudes and numbers with these names.
-
-    Parameters
-    ----------
-    names
-        Each is a field of `GRADIENT_FIELDS`, an amplitude, or the key of a number.
-    start
-        State whose amplitudes are allowed.
-
-    Raises
-    ------
-    CaseError
-        If the case does not have one of them.
-    """
-    try:
-        for name in names:
-            if name not in GRADIENT_FIELDS and name not in start.mu:
-                number_at_key(context, name)
-    except CaseError as e:
-        raise CaseError(f"gradients.by: {e}") from None
-
-
-def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
+def perturbed_scene(scenes: SceneCache, key: str, value: float) -> Scene:
     """Return the scene of the case with another number, on the same mesh; collective.
 
     Parameters
     ----------
+    scenes
+        Scenes on the mesh of a base: the scene of the case.
     key, value
         Key of the number in the case, and its new value.
 
@@ -191,61 +157,11 @@ def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
         If the number breaks the symmetry by which only a part is modelled, or moves an edge of a
         patch.
     """
-    old, new = scene.problem, scene.problem.with_values({key: value})
-    if (old.axisymmetric, old.mirror, old.azimuth) != (new.axisymmetric, new.mirror, new.azimuth):
-        raise CaseError(
-            f"{key}: a change of it breaks the symmetry of the model: give the case symmetry: none"
-        )
-    if new.patched and _rims(new) != _rims(old):
-        raise CaseError(
-            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width "
-            "with a unit depends on no other number"
-        )
-    return Scene(problem_on_mesh_of(scene, new), scene.comm)
-
-
-def _rims(problem: Problem) -> list[object]:
-    """Return half-width and place of each rim of a dimple that is an edge of a patch."""
-    shell = problem.context.shell
-    local_imperfections = [
-        section for section in problem.imperfections.values() if isinstance(section, LocalSection)
-    ]
-    return [
-        (section.half_width(shell.R_over_h, shell.poisson_ratio), section.at)
-        for section in local_imperfections
-        if section.patch
-    ]
-
-
-def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
-    """Return a problem on the mesh of a scene, whose nodes stay where they are in the chart.
-
-    Their places in space follow from the new problem.
-
-    Parameters
-    ----------
-    new
-        Problem that differs from the scene's in numbers alone, also of imperfections.
-    """
-    old, model = scene.problem, scene.model
-    meridian, shape = old.meridian, old.shape
-    if model.midsurface:
-        shape = model.midsurface.with_embedding(new.embedding)
-    elif model.axisymmetric:
-        assert new.meridian
-        meridian = replace(new.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0]))
-    return replace(
-        old,
-        context=new.context,
-        lambda_m=new.lambda_m,
-        body=new.body,
-        material=new.material,
-        loads=new.loads,
-        thickness=new.thickness,
-        embedding=new.embedding,
-        meridian=meridian,
-        shape=shape,
-    )
+    assert scenes.base
+    try:
+        return scenes.at((key, value), partial(scenes.base.problem.with_values, {key: value}))
+    except UnfitMesh as e:
+        raise CaseError(f"{key}: {e}") from None
 
 
 def state_with_new_loads(
@@ -333,26 +249,35 @@ def target_ratios(
     return ratios
 
 
-def same_chart_bounds(shape: object, other: object) -> bool:
-    """Return whether two shapes have the same bounds of their charts; True if unknown.
+def expand_contact(scene: Scene, other: Scene, state: State) -> None:
+    """Expand all contact in another scene into polynomials about a state of the first scene.
 
-    A chart with other bounds needs another mesh.
+    Places in contact then stay, so that differences of residuals are smooth. Both scenes have the
+    same mesh. Contact of bodies is expanded about the gap at the state. Collective.
     """
-    bounds, other_bounds = chart_bounds(shape), chart_bounds(other)
-    if bounds is None or other_bounds is None:
-        return True
-    return np.allclose(bounds[0], other_bounds[0], 0, 1e-14) and np.allclose(
-        bounds[1], other_bounds[1], 0, 1e-14
+    expand_shell_contact(scene, other, state)
+    evaluation = scene.model.system.at_state(state)
+    # the same body in both scenes
+    for name, (body_contact, _) in scene.model.contacts.items():
+        other_contact, _ = other.model.contacts[name]
+        gap_at_state = evaluation.evaluate(partial(getattr, body_contact, "gap"))
+        other_contact.expand_about(gap_at_state)
+
+
+def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
+    """Expand contact between shells in another scene into polynomials about a state of the first.
+
+    Both scenes have the same mesh. If contact of the first scene is an expansion already, the other
+    scene takes this one. Collective.
+    """
+    assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
+        "contact is given by numbers of cells"
     )
-
-
-def chart_bounds(shape: object) -> tuple[Array, Array] | None:
-    """Return the bounds of the chart of a shape, lower and upper (2,); None if unknown.
-
-    A disc has zeros and its radius in their place.
-    """
-    if isinstance(shape, Grid):
-        return np.array(shape.low), np.array(shape.high)
-    box: tuple[Array, Array] | None = getattr(shape, "box", None)
-    radius = getattr(shape, "radius", None)
-    return (np.zeros(2), np.full(2, radius)) if radius is not None else box
+    evaluation = scene.model.system.at_state(state)
+    contacts: Sequence[Any] = scene.model.shell_contacts
+    other_contacts: Sequence[Any] = other.model.shell_contacts
+    for shell_contact, other_contact in zip(contacts, other_contacts, strict=True):
+        if shell_contact.held:  # the expansion that takes its place
+            other_contact.hold(shell_contact.held)
+        else:
+            other_contact.expand_about(evaluation.evaluate(shell_contact.freeze))

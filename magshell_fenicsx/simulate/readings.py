@@ -53,6 +53,7 @@ from magshell_fenicsx.simulate.perturbation import number_at_key, scale_at_key
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import conjugates
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.steps import stage_of_step
 
@@ -385,10 +386,10 @@ class ResultSampler:
         has_place
             For each result, whether it is read at a place, which stays as the number changes.
         """
-        scenes_at_values = dict[float, Scene]()  # the same for all results
+        scenes = SceneCache(base=self.scene)  # the same for all results
         slopes = np.array(
             [
-                float(derivative(result_adjoint, key, scenes_at_values))  # type: ignore[arg-type]
+                float(derivative(result_adjoint, key, scenes))  # type: ignore[arg-type]
                 for result_adjoint in adjoints
             ]
         )

@@ -18,7 +18,6 @@ Words and symbols:
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from math import copysign
 from typing import TYPE_CHECKING, Any
@@ -41,8 +40,6 @@ from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
-from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.observables import ModelView
 from magshell_fenicsx.parts.pressure.openings import no_potential
@@ -272,35 +269,7 @@ class Scene:
         # The first iterations only find out what touches, and the solver must have patience.
         return NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses=stiffnesses)
 
-    def with_field_strength(self, context: Context) -> "Scene":
-        """Return the scene of a case that differs by the strength of the field alone.
-
-        It has the same model and solver. Neither is built again.
-
-        Parameters
-        ----------
-        context
-            What the sections of the other case have made of its file.
-        """
-        return self._copy(
-            problem=replace(self.problem, context=context, lambda_m=strength(context))
-        )
-
-    def with_model(self, problem: Problem, model: MeridianModel) -> "Scene":
-        """Return the scene of a problem that differs in numbers alone, with a model that has them.
-
-        The solver has the options of this scene's solver.
-
-        Parameters
-        ----------
-        problem, model
-            The other problem, and its model on the same mesh.
-        """
-        return self._copy(
-            problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
-        )
-
-    def _copy(self, **changes: Any) -> "Scene":
+    def copied(self, **changes: Any) -> "Scene":
         """Return a copy with changed attributes; cached properties are computed anew.
 
         Parameters

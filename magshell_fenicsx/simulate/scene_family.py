@@ -3,7 +3,7 @@
 A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays
 in one scene. Every other one has a scene for each value, on the same mesh in the chart; where the
 chart changes its size, the mesh with it. Of meridians these scenes share forms and kernels
-(`shared_forms`).
+(`scene_cache`).
 
 Words and symbols:
 
@@ -27,7 +27,6 @@ from functools import cached_property
 from math import isclose
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.augmented import BoundaryPoint, Kind, NoSystem
 from magshell_fenicsx.continuation.boundary import BoundaryLost
@@ -42,16 +41,11 @@ from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
 from magshell_fenicsx.simulate.path_records import LOCATED
-from magshell_fenicsx.simulate.perturbation import (
-    chart_bounds,
-    problem_on_mesh_of,
-    same_chart_bounds,
-)
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import stage_of_record
-from magshell_fenicsx.simulate.shared_forms import SharedForms
+from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh
 from magshell_fenicsx.simulate.stage import Stage
+from magshell_fenicsx.simulate.steps import stage_of_record
 from magshell_fenicsx.simulate.transfer import transfer
 
 MakeProblem = Callable[[float], Problem]  # from a value of the number
@@ -203,8 +197,8 @@ class SceneFamily:
     _linear_amplitudes
         Amplitudes as linear functions of p; None if they are not linear, or not only these depend
         on p.
-    _shared_forms
-        Forms that the scenes at all p share; None if each has its own.
+    _scenes
+        Scenes on the mesh of the origin, which may share its forms.
 
     Raises
     ------
@@ -227,17 +221,16 @@ class SceneFamily:
         self._make_problem, self._range, self._record = make_problem, value_range, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}
-        self._shared_forms: SharedForms | None = None
         self._linear_amplitudes: _LinearAmplitudes | None = None
         self._refuse_unfollowable(scene)
         # origin: the scene whose mesh, state and amplitudes all others have
         self._origin, self.has_one_scene = scene, False
+        self._scenes = SceneCache(base=scene, moves_mesh=True)
         self._test_value = self._choose_test_value(value)
-        base = self._origin if self._origin is not scene else self._scene(value)
-        point = replace(record.point, state=self._state_in(base, value))
-        self._first = replace(record, point=point)  # the record in the base, the scene at `value`
+        state = State(self._record.point.state.u, self._amplitudes(value))
+        self._first = replace(record, point=replace(record.point, state=state))
         self._record_value = value
-        self._stages[value] = self._base = stage_of_record(base, self._first)
+        self._stages[value] = self._base = stage_of_record(self._origin, self._first)
         self.has_one_scene = self._depends_by_amplitudes_alone(value)
         if not self.has_one_scene:
             self._share_forms(value)
@@ -284,6 +277,7 @@ class SceneFamily:
         # the scene there has all amplitudes, so it becomes the origin
         old_origin, old_state = self._origin, self._record.point.state
         self._origin = scenes[test_value]
+        self._scenes = SceneCache(base=self._origin, moves_mesh=True)
         problem = self._origin.problem
         u, mu = transfer(old_origin, self._origin, old_state.u), dict(old_state.mu)
         mu |= {name: problem.lambda_m if name == "lambda_m" else 0.0 for name in new_names}
@@ -549,30 +543,13 @@ class SceneFamily:
         NoSystem
             If the model's symmetry or the mesh differs in kind, or there is no mesh.
         """
-        old, new = self._origin.problem, self.problem(p)
-        old_symmetry, new_symmetry = (
-            (problem.axisymmetric, problem.mirror, problem.azimuth) for problem in (old, new)
-        )
-        if old_symmetry != new_symmetry:
-            raise NoSystem(
-                "the symmetry of the model changes on the way: give the case symmetry: none"
-            )
+        problem = self.problem(p)
         try:
-            on_mesh = problem_on_moved_mesh(self._origin, new)
-            # None where the shared forms cannot serve this problem
-            if self._shared_forms and (scene := self._shared_forms.scene_at(p, on_mesh)):
-                return scene
-            return Scene(on_mesh, self._origin.comm)
+            return self._scenes.scene_for(problem)
+        except UnfitMesh as e:
+            raise NoSystem(str(e)) from None
         except MeshError as e:
             raise NoSystem(f"there is no mesh: {e}") from None
-
-    def _state_in(self, base: Scene, p: float) -> State:
-        """Return the record's state in the unknowns of another scene, with the amplitudes at p.
-
-        The order of unknowns on the ranks may differ between scenes of the family.
-        """
-        state = self._record.point.state
-        return State(transfer(self._origin, base, state.u), self._amplitudes(p))
 
     def _amplitudes(self, p: float) -> dict[str, float]:
         """Return amplitude of the model -> its value at the instability, for the number p.
@@ -639,15 +616,14 @@ class SceneFamily:
         equal those of their own scenes, relative to the change of forces by p. Otherwise each value
         keeps a scene of its own.
         """
-        shared_forms = SharedForms.of_scene(self._base.scene)
-        if shared_forms is None:
+        if not self._scenes.share_forms():
             return
         stages, comm = self._stages, self._origin.model.system.comm
         # forces of the scenes with forms of their own, and how much they change with p
         forces_at = {p: self._forces(stage, p) for p, stage in stages.items()}
         change = max(max_abs(comm, forces - forces_at[value]) for forces in forces_at.values())
         # the same with shared forms: `_stage` now makes stages that have these
-        self._shared_forms, self._stages = shared_forms, {}
+        self._stages = {}
         differences = [
             max_abs(comm, self._forces(self._stage(p), p) - forces)
             for p, forces in forces_at.items()
@@ -656,8 +632,8 @@ class SceneFamily:
             self._base = self._stage(value)
             return
         # back to scenes with forms of their own
-        shared_forms.leave()
-        self._shared_forms, self._stages = None, stages
+        self._scenes.leave_forms()
+        self._stages = stages
 
     def _forces(self, stage: Stage, p: float) -> Vector:
         """Return the quantities of a stage at p that a boundary depends on, in one vector.
@@ -690,51 +666,3 @@ def _waves(stage: Stage) -> Waves:
     model = stage.scene.model
     assert model.axisymmetric
     return model.waves
-
-
-def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
-    """Return a problem on the mesh of a scene, which is stretched with the chart.
-
-    A meridian's vertices move linearly between knots, the parameters at which cells must end. The
-    nodes of a flat mesh move with the bounds of the chart.
-
-    Raises
-    ------
-    NoSystem
-        If the mesh cannot follow the change of the chart.
-    """
-    on_mesh, old = problem_on_mesh_of(scene, new), scene.problem
-    if scene.model.axisymmetric:
-        assert old.meridian
-        assert new.meridian
-        assert on_mesh.meridian
-        vertices = on_mesh.meridian.vertices
-        assert vertices is not None
-        # parameters at which cells must end, such as rims
-        knots, new_knots = old.meridian.knots, new.meridian.knots
-        if knots.shape != new_knots.shape:
-            raise NoSystem("a rim of a dimple appears or vanishes on the way")
-        moved_vertices = np.interp(vertices, knots, new_knots)
-        return replace(on_mesh, meridian=replace(on_mesh.meridian, vertices=moved_vertices))
-    if scene.model.midsurface and not same_chart_bounds(old.shape, new.shape):
-        patch = scene.model.midsurface.with_embedding(new.embedding)
-        nodes = _moved_nodes(patch.nodes, old.shape, new.shape)
-        if nodes is None:
-            raise NoSystem("the mesh of this shape cannot move with the number")
-        return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
-    return on_mesh
-
-
-def _moved_nodes(
-    nodes: NDArray[np.float64], old_shape: object, new_shape: object
-) -> NDArray[np.float64] | None:
-    """Return nodes that move linearly with the bounds of a chart; None if they cannot."""
-    old_bounds, new_bounds = chart_bounds(old_shape), chart_bounds(new_shape)
-    if old_bounds is None or new_bounds is None:
-        return None
-    if nodes.shape[1] != 2:  # nodes of a mesh file have three coordinates
-        return None
-    (old_low, old_high), (new_low, new_high) = old_bounds, new_bounds
-    old_size, new_size = old_high - old_low, new_high - new_low
-    moved_nodes: NDArray[np.float64] = new_low + (nodes - old_low) / old_size * new_size
-    return moved_nodes

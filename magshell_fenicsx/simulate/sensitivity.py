@@ -1,6 +1,7 @@
 """Sensitivities of the amplitude at a fold, for instance of the buckling pressure.
 
-The derivative d mu*/dp = -(phi . R_p)/(phi . R_mu) takes one dot product for each parameter p.
+They are gradients: the `Adjoint` of the fold gives the derivative d mu*/dp = w . R_p by each
+parameter p, with w = -phi/(phi . R_mu).
 
 By the numbers of an imperfection R_p is a central difference, (R(r0 + s dr0/dp) - R(r0 - s
 dr0/dp))/(2 s): where the chart's nodes stay, r0 alone depends on an imperfection. A rim makes r0
@@ -12,19 +13,15 @@ Words and symbols:
 
 - R is the residual Pi_u, the derivative of the potential energy by the displacement u; phi is the
   left null vector of the tangent at the fold. mu holds the amplitudes (load parameters) by name.
-- A load column of a parameter p is the vector R_p, zero at supports. One dot product with phi turns
-  it into the derivative of the fold's amplitude; `continuation.fold.sensitivity` does so.
 - r0 is the undeformed mid-surface, a function of the chart (its coordinates). A deviation w0 is its
   distance from the perfect surface. A rim is the edge of a dimple; it may separate patches.
 - h and R are thickness and reference length; lambda_m is the strength of the magnetic field.
-- A stage is a scene with the solver of one step, whose system may have further unknowns; `leave`
-  converts its states to states of the model.
+- A stage is a scene with the solver of one step, whose system may have further unknowns.
 - In a case of several shells each one is a member shell, with sections of its own.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from math import degrees
 from typing import Any, TypeAlias
 
@@ -33,13 +30,10 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold, sensitivity
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.fold import Fold, residual_multiplier
+from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, Deviation
-from magshell_fenicsx.models.shell.spatial_fields import Pattern, WithinRims
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionSection,
@@ -47,57 +41,32 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
     imperfection_geometries,
     in_frame,
 )
-from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.energy_factory import EnergyFactory
-from magshell_fenicsx.simulate.perturbation import number_at_key, perturbed_scene, scale_at_key
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint_of_fold, by_load
+from magshell_fenicsx.simulate.gradients.fields import by_field, magnetic_terms
+from magshell_fenicsx.simulate.perturbation import (
+    expand_contact,
+    number_at_key,
+    perturbed_scene,
+    scale_at_key,
+)
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.simulate.stage import Stage, load_stage
-from magshell_fenicsx.simulate.steps import stage_of_step
-from magshell_fenicsx.simulate.transfer import same_mesh, transfer
+from magshell_fenicsx.simulate.steps import stage_of_record
+from magshell_fenicsx.simulate.transfer import transfer
 
 NONZERO_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
 Array = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
 Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
 # steps of differences, of h, of a width or of the angle of a half-width
 RESIDUAL_STEP = 1e-3  # for the residual
 DEVIATION_STEP = 1e-6  # for dr0/dp
-
-
-def fold_at(scene: Scene, record: Record) -> Fold:
-    """Return the fold at a record with the label "fold", with its null vector; collective.
-
-    Parameters
-    ----------
-    record
-        Row of the history of this scene.
-
-    Raises
-    ------
-    ValueError
-        If the record has another label.
-    FoldLost
-        If Newton's method for the fold fails.
-    """
-    if record.label != "fold":
-        raise ValueError(f"this record is no fold, but a {record.label}")
-    scene.refuse_foreign(record.point.state)
-    stage = stage_of_record(scene, record)
-    return find_fold(stage.newton, FoldGuess(stage.enter(record.point.state)), record.amplitude)
-
-
-def stage_of_record(scene: Scene, record: Record) -> Stage:
-    """Return the stage of a record's step: the scene with the solver of this step.
-
-    It holds the conjugates that the step holds, at the values of the record.
-    """
-    if not record.step:
-        return load_stage(scene)
-    return stage_of_step(scene, scene.problem.programme[record.step - 1], record.point.state)
 
 
 def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:
@@ -121,40 +90,94 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
       times the derivative in lambda_m.
     """
     stage = stage_of_record(scene, record) if record else load_stage(scene)
-    system, state, history = stage.newton.system, fold.state, scene.model.system.history
-    # load columns of the amplitudes, then of the remanence and of a field of strength zero
-    columns = {
-        name: system.load(state.u, state.mu, name)
-        for name in state.mu
-        # entries of the history, as angles of edges, are no parameters
-        if name not in (fold.name, *history)
+    adjoint = adjoint_of_fold(stage, fold)
+    # entries of the history, as angles of edges, are no parameters
+    not_varied = {fold.name, *scene.model.system.history}
+    amplitudes = [name for name in fold.state.mu if name not in not_varied]
+    return {
+        **{name: by_load(adjoint, name) for name in amplitudes},
+        **_by_remanence(adjoint),
+        **_by_absent_field(adjoint),
+        **_by_imperfections(stage, fold),
+        **_by_imperfections_of_member_shells(stage, fold),
     }
-    by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
-    columns |= {  # columns of the model get zeros for unknown amplitudes
-        name: stage.padded(column)
-        for name, column in (by_patch | _field_column(scene, state)).items()
-    }
-    by_column = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return (
-        by_column
-        | imperfection_sensitivities(stage, fold)
-        | member_shell_sensitivities(stage, fold)
-    )
 
 
-def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """Return "lambda_m" -> R_lambda_m at lambda_m = 0, the load column of a field; collective.
+def _by_remanence(adjoint: Adjoint) -> dict[str, float]:
+    """Return name -> derivative by a relative change of the remanence of one patch; collective.
+
+    Empty without a remanence, with a soft material alone, and where magnets interact, as the energy
+    then is quadratic in the remanence.
+    """
+    scene, loads = adjoint.scene, adjoint.scene.model.loads
+    field = loads.magnetic
+    if field is None or loads.interaction:
+        return {}
+    if field.soft and field.soft.alone:
+        return {}
+    gradient = by_field(adjoint, "magnitude")
+    is_of_shells = field.patches and scene.problem.context.sections.get("shells")
+    if is_of_shells:
+        masks = _of_shells(scene, field, len(gradient.forces))
+    elif scene.problem.within:
+        masks = _of_rims(scene.problem, gradient.places.mean(axis=1))
+    else:
+        masks = {"": np.ones(len(gradient.forces), dtype=bool)}
+    return {
+        f"remanence {patch}".rstrip(): float(gradient.within(cells)[0])
+        for patch, cells in masks.items()
+    }
+
+
+def _of_rims(problem: Problem, centres: Array) -> dict[str, Mask]:
+    """Return patch -> which cells are within the rim of this dimple; "rest": within none.
+
+    Where two rims overlap, the first one counts.
+
+    Parameters
+    ----------
+    centres
+        Centres (cells, 3) of the cells, of which each is within a rim or outside of it.
+    """
+    masks = dict[str, Mask]()
+    rest: Mask = np.ones(len(centres), dtype=bool)
+    for name, is_inside in problem.within.items():
+        masks[name] = rest & is_inside(centres)
+        rest = rest & ~masks[name]
+    return {**masks, "rest": rest}
+
+
+def _of_shells(scene: Scene, field: Magnetisation, count: int) -> dict[str, Mask]:
+    """Return patch -> which of this rank's own cells have the remanence of this patch.
+
+    Where patches overlap, the last one counts.
+
+    Parameters
+    ----------
+    count
+        Number of this rank's own cells.
+    """
+    model, patches = scene.model, dict[str, Mask]()
+    if model.midsurface:
+        patches |= model.midsurface.patches
+    elif model.axisymmetric:
+        patches |= model.meridian.patches
+    masks = dict[str, Mask]()
+    rest: Mask = np.ones(count, dtype=bool)
+    for name in reversed(list(field.patches or ())):
+        masks[name] = rest & patches[name][:count]
+        rest = rest & ~masks[name]
+    return dict(reversed(masks.items()))
+
+
+def _by_absent_field(adjoint: Adjoint) -> dict[str, float]:
+    """Return "lambda_m" -> derivative by the strength of a field at lambda_m = 0; collective.
 
     It serves a case whose section `magnetic` has the strength zero, so that the model has no such
     amplitude. Empty without this section, with another strength, and where the field would preserve
     less symmetry than the model has.
-
-    Parameters
-    ----------
-    state
-        State of the stage's system.
     """
-    problem = scene.problem
+    scene, problem, state = adjoint.scene, adjoint.scene.problem, adjoint.state
     if problem.context.section_of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
     without_field = dict.fromkeys(  # None: not given, as lambda_m replaces them
@@ -168,110 +191,8 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     assert with_field.loads.magnetic
     if not is_whole and symmetry != symmetry_with_field:
         return {}
-    # unknown amplitudes stand behind the displacements
-    model_state = State(state.u[: scene.model.system.size], state.mu)
-    return {"lambda_m": _magnetic_column(scene, model_state, with_field.loads.magnetic)}
-
-
-@dataclass(frozen=True)
-class _RemanenceWithin:
-    """A remanence in one patch, zero elsewhere.
-
-    Attributes
-    ----------
-    remanence
-        Vector (3,) over the largest flux density, or function of places and normals (n, 3).
-    patch
-        Function of places and normals that is 1 in the patch, and 0 elsewhere.
-    """
-
-    remanence: Array | Pattern
-    patch: WithinRims
-
-    def __call__(self, r0: Array, n0: Array) -> Array:
-        vectors = self.remanence(r0, n0) if callable(self.remanence) else self.remanence
-        return np.asarray(vectors * self.patch(r0, n0))
-
-
-def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
-    """Return name of a sensitivity -> load column mu_i dPi_i/du of the remanence of one patch.
-
-    Pi_i is the magnetic energy, mu_i its amplitude. So the column belongs to a relative change of
-    the remanence in this patch. Empty without a remanence, with a soft material alone, and where
-    magnets interact, as the energy then is quadratic in the remanence. Collective.
-
-    Parameters
-    ----------
-    fold
-        Fold with a state of the model.
-    """
-    field = scene.model.loads.magnetic
-    if field is None or scene.model.loads.interaction:
-        return {}
-    if field.soft and field.soft.alone:
-        return {}
-    rims_by_patch = scene.problem.within
-    if field.patches and scene.problem.context.sections.get("shells"):
-        return _remanence_columns_of_shells(scene, fold.state, field, field.patches)
-    if not rims_by_patch:
-        return {"remanence": _magnetic_column(scene, fold.state, field)}
-
-    # factors of the three components of the remanence
-    ones, zeros = np.ones(3), 0 * np.ones(3)
-
-    def factor_of(patch: str) -> WithinRims:
-        """Return the factor that is 1 within a patch, and 0 elsewhere."""
-        factor_within_rims = tuple(
-            (rim, ones if name == patch else zeros) for name, rim in rims_by_patch.items()
-        )
-        factor_outside = ones if patch == "rest" else zeros
-        return WithinRims(factor_within_rims, factor_outside)
-
-    patches = (*rims_by_patch, "rest")
-    field_of_patch = {
-        patch: _RemanenceWithin(field.remanent, factor_of(patch)) for patch in patches
-    }
-    return {
-        f"remanence {patch}": _magnetic_column(
-            scene, fold.state, replace(field, remanent=remanence)
-        )
-        for patch, remanence in field_of_patch.items()
-    }
-
-
-def _remanence_columns_of_shells(
-    scene: Scene, state: State, field: Magnetisation, patches: Mapping[str, Array | Pattern]
-) -> dict[str, Vector]:
-    """Return name of a sensitivity -> load column of the remanence of one of several shells.
-
-    Collective.
-
-    Parameters
-    ----------
-    patches
-        Shell -> its remanence.
-    """
-    model = scene.model
-    cells_of_patches: Mapping[str, NDArray[np.bool_]]  # shell -> which cells are its own
-    if model.midsurface:
-        cell_map = model.midsurface.mesh.topology.index_map(2)
-        cells_of_patches = model.midsurface.patches
-        cell_count = cell_map.size_local + cell_map.num_ghosts
-    else:
-        assert model.axisymmetric
-        cells_of_patches, cell_count = model.meridian.patches, len(model.meridian.order)
-    # the magnetisation with the remanence of one shell, and zero in all others
-    without_remanence = dict.fromkeys(patches, np.zeros(3))
-    field_of_shell = {
-        name: replace(field, patches={**without_remanence, name: remanence}).on_cells(
-            cells_of_patches, cell_count
-        )
-        for name, remanence in patches.items()
-    }
-    return {
-        f"remanence {name}": _magnetic_column(scene, state, field)
-        for name, field in field_of_shell.items()
-    }
+    column = _magnetic_column(scene, state, with_field.loads.magnetic)
+    return {"lambda_m": float(dot(scene.model.system.comm, adjoint.places[0].w, column))}
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
@@ -302,41 +223,8 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
     return np.array(column.x.array[: model.system.size])
 
 
-def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """Return the magnetic terms of a model with another remanence, in the applied field of a state.
-
-    Parameters
-    ----------
-    field
-        Magnetisation with this remanence. A soft material alone has no terms.
-    """
-    terms, fields = _magnetic_terms_and_fields(scene, field)
-    # fields that are known by their values have amplitudes of their own
-    for applied in fields:
-        applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
-    return terms
-
-
-def _magnetic_terms_and_fields(
-    scene: Scene, field: Magnetisation
-) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
-    """Return the magnetic terms of a remanence, and the applied fields that they read.
-
-    A soft material alone has neither; beside a remanence it is left out.
-    """
-    model, log, fields = scene.model, KernelLog(), list[AppliedField]()
-    # the factory appends to `fields` the applied fields of the terms that it makes
-    factory = replace(model.factory, log=log, fields=fields)
-    if field.soft and field.soft.alone:
-        return [], fields
-    field = replace(field, soft=None)
-    if isinstance(factory, EnergyFactory):
-        return [factory.term(energy) for energy in factory.magnetic(field)], fields
-    return factory.magnetic(field), fields
-
-
-def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Return derivatives of a fold's amplitude by numbers of imperfections; collective.
+def _by_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:
+    """Return derivatives by the numbers of imperfections; collective.
 
     The keys are those of the case below `shell`, as "defect.amplitude"; angles are in degrees.
 
@@ -346,7 +234,7 @@ def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
     """
     problem = stage.scene.problem
     return {
-        f"{key}.{name}": _derivative(stage, fold, key, name)
+        f"{key}.{name}": _by_imperfection(stage, fold, key, name)
         for key, section in problem.imperfections.items()
         for name in section.parameters
         if _varies(problem, section, name)
@@ -375,8 +263,8 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
     return spherical and section.at.polar != 0
 
 
-def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
-    """Return the derivative of a fold's amplitude by one number p of an imperfection; collective.
+def _by_imperfection(stage: Stage, fold: Fold, key: str, name: str) -> float:
+    """Return the derivative by one number p of an imperfection; collective.
 
     Two central differences are nested. The inner one, between p - `tiny` and p + `tiny`, gives
     dw0/dp, as exact as rounding allows. The outer one moves the surface along dw0/dp, once for the
@@ -387,10 +275,9 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     key, name
         Key of the imperfection, such as "imperfections.0", and its number, such as "at.polar".
     """
-    scene = stage.scene
-    if scene.problem.axisymmetric and name.startswith("at."):
+    scene, problem = stage.scene, stage.scene.problem
+    if problem.axisymmetric and name.startswith("at."):
         return 0.0  # to first order an axisymmetric shell does not feel a centre beside the axis
-    problem = scene.problem
     # steps of both differences, over the scale of the number
     scale = _scale_of_number(problem, key, name)
     step, tiny = RESIDUAL_STEP * scale, DEVIATION_STEP * scale
@@ -399,27 +286,71 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
         for tiny_change in (tiny, -tiny)
     )
 
-    def amplitude_change(change: float) -> float:
-        """Return the change of the fold's amplitude for a change of the number, to first order."""
+    def scene_at(change: float) -> Scene:
+        """Return the scene for a change of the number, to first order."""
         deviation = DeviationDifference(forward, backward, factor=change / (2 * tiny))
-        return _amplitude_change(stage, fold, with_deviation(scene, deviation))
+        return with_deviation(scene, deviation)
 
     # amplitude -> keys of the imperfections that it makes grow in a step. Such an amplitude
     # multiplies the deviation
-    keys_of_amplitudes = grown_by(scene.problem.programme, problem.imperfections)
+    keys_of_amplitudes = grown_by(problem.programme, problem.imperfections)
     factors = [
         fold.state.mu[amplitude] for amplitude, keys in keys_of_amplitudes.items() if key in keys
     ]
     factor = factors[0] if factors else 1.0
-    return factor * (amplitude_change(step) - amplitude_change(-step)) / (2 * step)
+    return factor * _central_difference(stage, fold, scene_at, step)
+
+
+def _by_imperfections_of_member_shells(stage: Stage, fold: Fold) -> dict[str, float]:
+    """Return key -> derivative by a number of an imperfection of one of several shells; collective.
+
+    Each of these shells has its own section in the case.
+    """
+    members = stage.scene.problem.context.sections.get("shells") or {}
+    scenes = SceneCache(base=stage.scene)
+    return {key: _by_number(stage, fold, key, scenes) for key in _numbers_of_member_shells(members)}
+
+
+def _by_number(stage: Stage, fold: Fold, key: str, scenes: SceneCache) -> float:
+    """Return the derivative by a number of the case, from scenes on the same mesh; collective."""
+    context = stage.scene.problem.context
+    value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
+    return _central_difference(
+        stage, fold, lambda change: perturbed_scene(scenes, key, value + change), step
+    )
+
+
+def _numbers_of_member_shells(members: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the keys of the numbers of several shells' imperfections, but for their centres."""
+    for name, member in members.items():
+        for index, section in enumerate(member.shell.imperfections):
+            for number in section.parameters:
+                if not number.startswith("at."):
+                    yield f"shells.{name}.shell.imperfections.{index}.{number}"
+
+
+def _central_difference(
+    stage: Stage, fold: Fold, scene_at: Callable[[float], Scene], step: float
+) -> float:
+    """Return the derivative of a fold's amplitude by a number, from two scenes; collective.
+
+    Parameters
+    ----------
+    scene_at
+        Change of the number -> scene on the same mesh.
+    step
+        Change of the number in the one scene; in the other one it is the negative.
+    """
+    forward, backward = (_amplitude_change(stage, fold, scene_at(c)) for c in (step, -step))
+    return (forward - backward) / (2 * step)
 
 
 def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
-    """Return -(phi . R)/(phi . R_mu) of a fold's state in a scene with a slightly other shell.
+    """Return w . R of a fold's state in a scene with a slightly other shell; collective.
 
     It is the change of the fold's amplitude to first order: at the fold's own displacement and
     amplitudes the other shell has a residual R that is not zero. Places in contact stay the same as
-    in the fold's state. Collective.
+    in the fold's state.
 
     Parameters
     ----------
@@ -427,7 +358,6 @@ def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
         Scene of the other shell on the same mesh.
     """
     scene, size = stage.scene, stage.scene.model.system.size
-    assert same_mesh(scene, other)
     u, left_null_vector = (
         # unknown amplitudes of a loading device come after the displacement, and stay as they are
         np.concatenate([transfer(scene, other, vector[:size]), vector[size:]])
@@ -436,76 +366,8 @@ def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
     expand_contact(scene, other, stage.leave(fold.state))
     system = stage.on_scene(other).newton.system
     other_fold = replace(fold, state=State(u, fold.state.mu), left_null_vector=left_null_vector)
-    return sensitivity(system, other_fold, system.residual(u, fold.state.mu))
-
-
-def expand_contact(scene: Scene, other: Scene, state: State) -> None:
-    """Expand all contact in another scene into polynomials about a state of the first scene.
-
-    Places in contact then stay, so that differences of residuals are smooth. Both scenes have the
-    same mesh. Contact of bodies is expanded about the gap at the state. Collective.
-    """
-    expand_shell_contact(scene, other, state)
-    evaluation = scene.model.system.at_state(state)
-    # the same body in both scenes
-    for name, (body_contact, _) in scene.model.contacts.items():
-        other_contact, _ = other.model.contacts[name]
-        gap_at_state = evaluation.evaluate(partial(getattr, body_contact, "gap"))
-        other_contact.expand_about(gap_at_state)
-
-
-def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
-    """Expand contact between shells in another scene into polynomials about a state of the first.
-
-    Both scenes have the same mesh. If contact of the first scene is an expansion already, the other
-    scene takes this one. Collective.
-    """
-    assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
-        "contact is given by numbers of cells"
-    )
-    evaluation = scene.model.system.at_state(state)
-    contacts: Sequence[Any] = scene.model.shell_contacts
-    other_contacts: Sequence[Any] = other.model.shell_contacts
-    for shell_contact, other_contact in zip(contacts, other_contacts, strict=True):
-        if shell_contact.held:  # the expansion that takes its place
-            other_contact.hold(shell_contact.held)
-        else:
-            other_contact.expand_about(evaluation.evaluate(shell_contact.freeze))
-
-
-def member_shell_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Return key -> derivative of a fold's amplitude by a number of an imperfection; collective.
-
-    The imperfections are those of several shells, each of which has its own section in the case.
-    """
-    context, derivatives = stage.scene.problem.context, dict[str, float]()
-    for name, member in (context.sections.get("shells") or {}).items():
-        for index, section in enumerate(member.shell.imperfections):
-            for number in section.parameters:
-                key = f"shells.{name}.shell.imperfections.{index}.{number}"
-                if not number.startswith("at."):  # numbers of a centre are left out
-                    derivatives[key] = _derivative_by_number(stage, fold, key)
-    return derivatives
-
-
-def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
-    """Return the derivative of a fold's amplitude by a number of the case; collective.
-
-    It is a central difference of the change of this amplitude to first order, with a scene for each
-    of two values of the number.
-
-    Parameters
-    ----------
-    key
-        Key of the number in the case, as in "shells.upper.shell.imperfections.0.amplitude".
-    """
-    scene, context = stage.scene, stage.scene.problem.context
-    value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
-    forward, backward = (
-        _amplitude_change(stage, fold, perturbed_scene(scene, key, value + change))
-        for change in (step, -step)
-    )
-    return (forward - backward) / (2 * step)
+    residual = system.residual(u, fold.state.mu)
+    return dot(system.comm, residual_multiplier(system, other_fold), residual)
 
 
 def _scale_of_number(problem: Problem, key: str, name: str) -> float:

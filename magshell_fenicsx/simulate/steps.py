@@ -21,6 +21,7 @@ from dataclasses import replace
 
 from magshell_fenicsx.continuation.continuation_run import MAX_STEPS, ContinuationGoal
 from magshell_fenicsx.continuation.device import Conjugate
+from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
@@ -40,7 +41,7 @@ from magshell_fenicsx.simulate.path_records import (
 )
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import Stage, make_stage
+from magshell_fenicsx.simulate.stage import Stage, load_stage, make_stage
 from magshell_fenicsx.simulate.symmetry_switch import (
     SymmetrySwitch,
     follow_switched_branch,
@@ -279,6 +280,38 @@ def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     curves = None if course.at_once else course.curves
     held_conjugates = held_conjugates_of_step(scene, step, state)
     return make_stage(scene, state, held_conjugates, curves and (step.name, *curves))
+
+
+def stage_of_record(scene: Scene, record: Record) -> Stage:
+    """Return the stage of a record's step: the scene with the solver of this step.
+
+    It holds the conjugates that the step holds, at the values of the record.
+    """
+    if not record.step:
+        return load_stage(scene)
+    return stage_of_step(scene, scene.problem.programme[record.step - 1], record.point.state)
+
+
+def fold_at(scene: Scene, record: Record) -> Fold:
+    """Return the fold at a record with the label "fold", with its null vector; collective.
+
+    Parameters
+    ----------
+    record
+        Row of the history of this scene.
+
+    Raises
+    ------
+    ValueError
+        If the record has another label.
+    FoldLost
+        If Newton's method for the fold fails.
+    """
+    if record.label != "fold":
+        raise ValueError(f"this record is no fold, but a {record.label}")
+    scene.refuse_foreign(record.point.state)
+    stage = stage_of_record(scene, record)
+    return find_fold(stage.newton, FoldGuess(stage.enter(record.point.state)), record.amplitude)
 
 
 def held_conjugates_of_step(

@@ -39,7 +39,7 @@ from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, LostResult
 from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_end
 from magshell_fenicsx.simulate.results import Target, distances
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, DesignEvaluation, evaluate
 from magshell_fenicsx.studies.design_picture import ReachedShape, draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
@@ -94,8 +94,6 @@ class Design:
         Number of the present stage, from 1; 0 for the last one.
     seconds
         Wall time of each new evaluation.
-    _scene
-        Keeps the scene of an evaluation, a model with its solver, for the next one.
     """
 
     variables: Variables
@@ -107,7 +105,6 @@ class Design:
     tried: list[tuple[Array, DesignEvaluation]] = field(default_factory=list)
     stage: int = 0
     seconds: list[float] = field(default_factory=list)
-    _scene: SceneReuse = field(default_factory=SceneReuse)
 
     def __call__(self, x: Array) -> DesignEvaluation:
         """Return the evaluation of a vector of variables, stored or new; collective."""
@@ -160,10 +157,13 @@ class Design:
         """
         access_disk(self.comm, lambda: self.variables.write(x, vectors))
         case, goal = self.variables.case_of(x, vectors), self.goal
-        evaluation = evaluate(
-            case, x, self.variables, goal.results, goal.targets, self.comm, self._scene
-        )
+        evaluation = evaluate(case, x, self.variables, goal.results, goal.targets, self._scenes)
         return DesignEvaluation(**self.comm.bcast(asdict(evaluation)))
+
+    @cached_property
+    def _scenes(self) -> SceneCache:
+        """Scene of an evaluation, a model with its solver, for the next one."""
+        return SceneCache(self.comm, overwrites=True)
 
     @cached_property
     def _identity(self) -> dict[str, str]:

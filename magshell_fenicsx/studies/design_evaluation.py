@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.field_gradient import FieldGradient
@@ -38,7 +37,7 @@ from magshell_fenicsx.simulate.gradients.vibration import FIRST_FREQUENCIES, adj
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.design_variables import Variables
 from magshell_fenicsx.studies.runner import Case
 
@@ -79,8 +78,7 @@ def evaluate(
     variables: Variables,
     results: Sequence[str],
     targets: Mapping[str, Target],
-    comm: MPI.Comm,
-    scene_cache: SceneReuse,
+    scenes: SceneCache,
 ) -> DesignEvaluation:
     """Follow the path of a case, and differentiate its results; collective.
 
@@ -92,7 +90,7 @@ def evaluate(
         Names of the results; a key of `targets` is the mean square distance from that shape.
     targets
         Name of a shape -> map from undeformed to wanted places.
-    scene_cache
+    scenes
         Keeps the scene, a model with its solver, for the next case.
 
     Returns
@@ -100,7 +98,7 @@ def evaluate(
     Values and gradients; a note without values if the case cannot be meshed or has no such result.
     """
     try:
-        scene = scene_cache.scene_for(case.problem(variables.smooth), comm)
+        scene = scenes.scene_for(case.problem(variables.smooth))
         _refuse_missing_results(scene, variables, results, targets)
         path = _follow_until_enough(scene, results)
     except MeshError as e:

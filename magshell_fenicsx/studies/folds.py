@@ -14,7 +14,6 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_fold, predict_fold
@@ -22,6 +21,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene_cache import SceneCache, with_field_strength
 from magshell_fenicsx.simulate.transfer import chart, matching, same_mesh, transfer
 from magshell_fenicsx.studies.runner import Case
 from magshell_fenicsx.studies.samples import Values
@@ -29,7 +29,6 @@ from magshell_fenicsx.studies.samples import Values
 Array = NDArray[np.float64]
 MAX_PREDICTOR_FOLDS = 3  # folds of one continuation, for a quadratic extrapolation
 MOST_FOLDS = 20  # that are kept of earlier samples
-MOST_UNKNOWNS = 200_000  # of all kept scenes: 1 GB with their factors
 LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a jump to another fold
 
 
@@ -303,44 +302,16 @@ class KnownFolds:
         return total
 
 
-class Scenes:
-    """The scenes of a rank that were used last, each a model with its solver.
+def scene_of(case: Case, scenes: SceneCache) -> Scene:
+    """Return the scene of a case; cases that differ by the strength of the field alone share one.
 
-    Cases that differ by the strength of the field alone share one.
-
-    Attributes
-    ----------
-    _kept
-        Text of all that determines a scene but the strength of its field -> the scene; the one used
-        last stands last.
+    Raises
+    ------
+    MeshError
+        If the case cannot be meshed.
     """
-
-    def __init__(self) -> None:
-        self._kept: dict[str, Scene] = {}
-
-    def scene_of(self, case: Case) -> Scene:
-        """Return the scene of a case, made anew if none is kept.
-
-        Raises
-        ------
-        MeshError
-            If the case cannot be meshed.
-        """
-        # the scene is taken out, and put back below as the last one used
-        key = _apart_from_strength(case)
-        earlier_scene = self._kept.pop(key, None)
-        if earlier_scene:
-            scene = earlier_scene.with_field_strength(case.context)
-        else:
-            scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
-        self._kept[key] = scene
-        # the scenes that were used longest ago are dropped first
-        while (
-            sum(kept_scene.newton.system.size for kept_scene in self._kept.values()) > MOST_UNKNOWNS
-            and len(self._kept) > 1
-        ):
-            self._kept.pop(next(iter(self._kept)))
-        return scene
+    scene = scenes.at(_apart_from_strength(case), lambda: with_modes(case.problem(), scenes.comm))
+    return with_field_strength(scene, case.context)
 
 
 def _apart_from_strength(case: Case) -> str:

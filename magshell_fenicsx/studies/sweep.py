@@ -14,6 +14,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,8 @@ from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.runs.running import Result, run
-from magshell_fenicsx.studies.folds import Continuation, Scenes, fold_row, has_knockdown
+from magshell_fenicsx.simulate.scene_cache import SceneCache
+from magshell_fenicsx.studies.folds import Continuation, fold_row, has_knockdown, scene_of
 from magshell_fenicsx.studies.points import (
     MOST_POINTS,
     Axis,
@@ -61,6 +63,7 @@ NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.p
 FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
 # a model with an earlier one of these symmetries can show what a model with a later one does
 SYMMETRIES = "none", "half", "axisymmetric"
+MOST_UNKNOWNS = 200_000  # of the scenes that are kept: 1 GB with their factors
 # columns of sweep.csv that are of the limit point, and of curves.csv
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 CURVE = (
@@ -408,7 +411,9 @@ class SweepCache:
     """
 
     columns: Sequence[str] = CURVE
-    scenes: Scenes = field(default_factory=Scenes)
+    scenes: SceneCache = field(
+        default_factory=partial(SceneCache, MPI.COMM_SELF, max_unknowns=MOST_UNKNOWNS)
+    )
     first: Continuation | None = None
 
 
@@ -470,7 +475,7 @@ def _by_fold(
         Number of factorisations, of failed attempts too.
     """
     try:
-        scene = folds.scenes.scene_of(link.case)
+        scene = scene_of(link.case, folds.scenes)
     except MeshError:  # `_by_path` will report it
         return None, 0
     if same_mesh and not continuation.has_mesh_of(scene):

@@ -8,7 +8,7 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_family import problem_on_moved_mesh
+from magshell_fenicsx.simulate.scene_cache import problem_on_moved_mesh
 from magshell_fenicsx.studies.boundary_picture import _regions
 
 

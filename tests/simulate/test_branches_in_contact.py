@@ -13,11 +13,12 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.contact_control import before_passing, passes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.path_records import checked_run
-from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 from magshell_fenicsx.simulate.search import dented_states
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+from magshell_fenicsx.simulate.sensitivity import sensitivities
 from magshell_fenicsx.simulate.stage import load_stage
+from magshell_fenicsx.simulate.steps import fold_at
 from magshell_fenicsx.simulate.symmetry_switch import _mirrored
 
 h = 0.036

@@ -17,8 +17,8 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
-from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.results import functional
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 
 Array = NDArray[np.float64]
 STEP = 1e-2  # of h

@@ -26,7 +26,8 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.sensitivity import fold_at, with_deviation
+from magshell_fenicsx.simulate.sensitivity import with_deviation
+from magshell_fenicsx.simulate.steps import fold_at
 
 Array = NDArray[np.float64]
 FIELDS = ("thickness", "curvature", "deviation")

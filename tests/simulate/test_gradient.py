@@ -27,7 +27,8 @@ from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.perturbation import perturbed_scene
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.sensitivity import fold_at
+from magshell_fenicsx.simulate.scene_cache import SceneCache
+from magshell_fenicsx.simulate.steps import fold_at
 
 Array = NDArray[np.float64]
 ALONG = np.linspace(0, 1, 5)
@@ -132,7 +133,7 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
         return functional(scene, state, "tip_ux").value
 
     def softer(c: float) -> float:
-        there = perturbed_scene(scene, key, ratio * (1 + c))
+        there = perturbed_scene(SceneCache(base=scene), key, ratio * (1 + c))
         return functional(there, at(there, near), "tip_ux").value
 
     assert found_numbers["lambda_m"] == pytest.approx(

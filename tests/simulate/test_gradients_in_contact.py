@@ -25,9 +25,9 @@ from magshell_fenicsx.parts.contact.frozen_contact import _area_ratio
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
-from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 
 Array = NDArray[np.float64]
 h, GAP = 0.02, 1.001 * (0.02 + 0.025) / 2  # between mid-surfaces of 1 and 1.25 h

@@ -16,7 +16,8 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.fold import FoldGuess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+from magshell_fenicsx.simulate.sensitivity import sensitivities
+from magshell_fenicsx.simulate.steps import fold_at
 
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.45, "points": 1}
 DIMPLE = {"kind": "dimple", "amplitude": 1.64, "width": 3.2}

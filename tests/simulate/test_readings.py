@@ -14,6 +14,7 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.perturbation import perturbed_scene
 from magshell_fenicsx.simulate.readings import PlaceOutsidePath, PrescribedQuantity, Reading, read
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 
 
 def case_of(text: str, folder: Path, *settings: str) -> ms.Case:
@@ -33,7 +34,9 @@ def differences(case: ms.Case, wanted: list[Reading], key: str, step: float) -> 
     at, found = value[key], []
     assert at
     for way in (-1, 1):
-        other = perturbed_scene(ms.Scene(case), key, at * (1 + way * step))  # on the same mesh
+        other = perturbed_scene(
+            SceneCache(base=ms.Scene(case)), key, at * (1 + way * step)
+        )  # on the same mesh
         found.append(read(other, wanted, [key], slopes=False).values)
     return np.asarray((found[1] - found[0]) / (2 * at * step))
 

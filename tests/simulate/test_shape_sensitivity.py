@@ -11,11 +11,11 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.sensitivity import (
     DeviationDifference,
     _deviation,
-    fold_at,
     sensitivities,
     with_changed_number,
     with_deviation,
 )
+from magshell_fenicsx.simulate.steps import fold_at
 from magshell_fenicsx.simulate.transfer import transfer
 
 

@@ -7,9 +7,7 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_family import problem_on_moved_mesh
-from magshell_fenicsx.simulate.shared_forms import SharedForms
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 
 CASE: dict[str, Any] = {
     "shell": {
@@ -51,17 +49,14 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
             foundation_stiffness=2e-3,
         ),
     )
-    problems = {
-        float(i): problem_on_moved_mesh(first, case.problem()) for i, case in enumerate(cases)
-    }
-    alone = {value: Scene(problem) for value, problem in problems.items()}
-    shared = SharedForms.of_scene(first)
-    assert shared
-    scenes = {value: shared.scene_at(value, problem) for value, problem in problems.items()}
+    cache = SceneCache(base=first, moves_mesh=True)
+    alone = [cache.scene_for(case.problem()) for case in cases]
+    assert cache.share_forms()
+    scenes = [cache.scene_for(case.problem()) for case in cases]
+    assert all(scene.model.kernels is first.model.kernels for scene in scenes)
     u = 1e-3 * np.sin(np.arange(first.model.system.size))
-    for value in (0.0, 1.0, 0.0):
-        scene, own = scenes[value], alone[value]
-        assert scene
+    for number in (0, 1, 0):
+        scene, own = scenes[number], alone[number]
         state = State(
             own.model.system.zero_at_supports(u),
             {**own.unloaded().mu, "pressure": 0.8, "lambda_m": 0.002},
@@ -82,4 +77,4 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
 def test_what_is_more_than_numbers_is_not_shared() -> None:
     """The force at a pole is known by its form."""
     data = {**CASE, "loading": {"kind": "indentation", "depth": 1}}
-    assert SharedForms.of_scene(ms.Scene(ms.Case.model_validate(data))) is None
+    assert not SceneCache(base=ms.Scene(ms.Case.model_validate(data))).share_forms()

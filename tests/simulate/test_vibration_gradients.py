@@ -30,6 +30,7 @@ from magshell_fenicsx.simulate.gradients.vibration import frequency, vibration
 from magshell_fenicsx.simulate.perturbation import perturbed_scene
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import barrier
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 
 VOLUME = (
     "loading={kind: pressure, control: volume, until: target, volume_change: -0.004, points: 1}"
@@ -98,7 +99,9 @@ def test_meridian() -> None:
     labels = [mode.label for mode in ShellModes(scene.model).vibrations(last.point.state, 12)]
     key, step = "shell.poisson_ratio", 4e-3
     thicker = {c: changed(scene, "thickness", along, c * step) for c in (-2, -1, 1, 2)}
-    softer = {c: perturbed_scene(scene, key, 0.45 + c * step) for c in (-2, -1, 1, 2)}
+    softer = {
+        c: perturbed_scene(SceneCache(base=scene), key, 0.45 + c * step) for c in (-2, -1, 1, 2)
+    }
     states = {
         id(one): at_volume(one, last.point.state) for one in (*thicker.values(), *softer.values())
     }
@@ -175,7 +178,7 @@ def test_barrier(hold: str) -> None:
     expected = differences(lambda c: changed(scene, "thickness", along, c))
     assert by_thickness == pytest.approx(expected, rel=1e-5)
     assert found[key] == pytest.approx(
-        differences(lambda c: perturbed_scene(scene, key, 0.3 + c)), rel=1e-5
+        differences(lambda c: perturbed_scene(SceneCache(base=scene), key, 0.3 + c)), rel=1e-5
     )
 
 

@@ -19,8 +19,9 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, instabilities
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.perturbation import number_at_key, problem_on_mesh_of
+from magshell_fenicsx.simulate.perturbation import number_at_key
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 
 CAP = """
 shell:

@@ -15,7 +15,6 @@ from command import magshell
 from conftest import CAP, CASES, draw_nothing
 from interrupted import kill, start, wait_until
 from many import design, variables
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
@@ -23,7 +22,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.public import run
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 
 Array = NDArray[np.float64]
@@ -118,12 +117,12 @@ def test_fields_between_bounds(strip: Callable[[str], Path], tmp_path: Path) -> 
     source = read_source(strip(f"design: {{objective: {{maximise: tip_uz}}, {varied}}}\n"))
     case = Case.from_source(source)
     assert case.design
-    vary, standing = variables(source, case, case.design), SceneReuse()
+    vary, standing = variables(source, case, case.design), SceneCache(overwrites=True)
     x, way = vary.start_values, np.random.default_rng(0).standard_normal(len(vary.start_values))
 
     def at(c: float) -> DesignEvaluation:
         there = vary.case_of(x + c * way, tmp_path / "B.csv")
-        return evaluate(there, x, vary, ["tip_uz", "mass"], {}, MPI.COMM_WORLD, standing)
+        return evaluate(there, x, vary, ["tip_uz", "mass"], {}, standing)
 
     here, (further, back) = at(0.0), (at(1e-3), at(-1e-3))
     assert here.values["mass"] == pytest.approx(1, rel=1e-12)
@@ -346,7 +345,7 @@ def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
     vary = variables(source := read_source(file), case := Case.from_source(source), case.design)  # type: ignore[arg-type]
     way, B = np.random.default_rng(0).random(len(vary.start_values)), tmp_path / "B.csv"
     back, here, further = (
-        evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, MPI.COMM_WORLD, SceneReuse())
+        evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, SceneCache(overwrites=True))
         for x in (vary.start_values + c * way for c in (0.01, 0.02, 0.03))
     )
     slope = (further.values["omega2_1"] - back.values["omega2_1"]) / 0.02

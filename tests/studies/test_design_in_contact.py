@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import yaml
 from command import magshell
-from mpi4py import MPI
 from sheets import Sheet, write
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import read_source
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 from magshell_fenicsx.studies.design_variables import variables
 
@@ -102,7 +101,10 @@ def test_fields_of_unlike_shells(
     source = read_source(tmp_path / "strips.yaml")
     made = Case.from_source(source)
     assert made.design
-    vary, standing = variables(source, made, made.design, Case.from_source), SceneReuse()
+    vary, standing = (
+        variables(source, made, made.design, Case.from_source),
+        SceneCache(overwrites=True),
+    )
     start = vary.start_values + change
     way, results = (
         np.random.default_rng(0).standard_normal(len(start)),
@@ -111,7 +113,7 @@ def test_fields_of_unlike_shells(
 
     def at(c: float) -> DesignEvaluation:
         there = vary.case_of(start + c * way, tmp_path / "B.csv")
-        return evaluate(there, start, vary, results, {}, MPI.COMM_WORLD, standing)
+        return evaluate(there, start, vary, results, {}, standing)
 
     here, (further, back) = at(0.0), (at(1e-3), at(-1e-3))
     for result in results:

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import scipy
 from many import variables
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.design_evaluation import evaluate
 
 Array = NDArray[np.float64]
@@ -48,11 +47,11 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
     u = scene.model.system.with_ghosts(last.point.state.u)
     places = scene.model.r0.x.array.reshape(-1, 3)  # type: ignore[union-attr]
     there, tree = places + u.reshape(-1, 3), scipy.spatial.cKDTree(places)
-    misfits, standing = list[float](), SceneReuse()
+    misfits, standing = list[float](), SceneCache(overwrites=True)
 
     def misfit(x: Array) -> tuple[float, Array]:
         shape = {"shape": lambda at: there[tree.query(at)[1]]}
-        found = evaluate(made(x), x, vary, ["shape"], shape, MPI.COMM_SELF, standing)
+        found = evaluate(made(x), x, vary, ["shape"], shape, standing)
         misfits.append(found.values["shape"])
         return 1e6 * found.values["shape"], 1e6 * np.array(found.gradients["shape"])
 

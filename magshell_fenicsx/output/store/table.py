@@ -31,8 +31,6 @@ POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
 MAX_NUMBER = 1e100  # no run writes a larger one
-# columns that may be nan: a solid has no such split; a user-defined energy may be no number
-NAN_COLUMNS = ("stretching", "bending", "energy")
 
 
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
@@ -231,7 +229,7 @@ def read_lines(file: Path) -> list[dict[str, str]]:
 
 def _may_have_nan(column: str) -> bool:
     """Return whether a run may write nan into a column."""
-    return column.startswith(NAN_COLUMNS) or column not in COLUMNS
+    return column not in COLUMNS or quantity(column).may_be_nan
 
 
 def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:

@@ -40,7 +40,7 @@ from magshell_fenicsx.assembly.free_parameters import derived
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.device import Conjugate, Device
-from magshell_fenicsx.continuation.fold import Fold
+from magshell_fenicsx.continuation.fold import Fold, residual_multiplier
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
@@ -54,8 +54,13 @@ from magshell_fenicsx.simulate.contact_control import refuse_touching_shells
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import fold_at, stage_of_record
-from magshell_fenicsx.simulate.steps import enclosed_gas, held_conjugates_of_step
+from magshell_fenicsx.simulate.stage import Stage
+from magshell_fenicsx.simulate.steps import (
+    enclosed_gas,
+    fold_at,
+    held_conjugates_of_step,
+    stage_of_record,
+)
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
@@ -240,20 +245,25 @@ def adjoint_of_instability(
             + ": only of folds, and of waves"
         )
     fold = fold or fold_at(scene, record)
-    stage = stage_of_record(scene, record)
-    system = stage.newton.system
-    phi_by_load = dot(  # phi . R_mu
-        system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
-    )
-    # -phi/(phi . R_mu), which consists of w and, where conjugates are held, multipliers of the rows
-    multipliers = np.asarray(-fold.left_null_vector / phi_by_load)
+    adjoint = adjoint_of_fold(stage_of_record(scene, record), fold)
+    gas = with_gas(held_at(scene, record, record.point.state))
+    return with_begins(replace(adjoint, gas=gas), record, begins)
+
+
+def adjoint_of_fold(stage: Stage, fold: Fold) -> Adjoint:
+    """Return the adjoint of a fold's amplitude, while what its step holds keeps its values.
+
+    Parameters
+    ----------
+    stage
+        Stage of the step; the fold is one of its system. Collective.
+    """
+    # they consist of w and, where conjugates are held, multipliers of the rows
+    multipliers = residual_multiplier(stage.newton.system, fold)
     rows = stage.device.rates(multipliers) if stage.device else {}
     w = stage.device.displacement(multipliers) if stage.device else multipliers
     place = AdjointState(stage.leave(fold.state), np.array(w), rows)
-    gas = with_gas(held_at(scene, record, record.point.state))
-    return with_begins(
-        Adjoint(scene, [place], value=fold.value, gas=gas, free_amplitude=fold.name), record, begins
-    )
+    return Adjoint(stage.scene, [place], value=fold.value, free_amplitude=fold.name)
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:

@@ -40,6 +40,7 @@ from magshell_fenicsx.assembly.field_gradient import (
     WeightedTerm,
     derivatives_by_field,
 )
+from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.nonlocal_terms import FieldDifferentiable
 from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
@@ -48,9 +49,12 @@ from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.residual import ParameterDerivative
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField, Uniform
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.parts.observables import Slope
+from magshell_fenicsx.shells.energy_factory import EnergyFactory
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState, energies_along
 from magshell_fenicsx.simulate.gradients.shape import (
     fields_of_placement,
@@ -59,8 +63,8 @@ from magshell_fenicsx.simulate.gradients.shape import (
     of_widths,
     rates,
 )
+from magshell_fenicsx.simulate.perturbation import expand_shell_contact
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import expand_shell_contact, magnetic_terms
 from magshell_fenicsx.simulate.transfer import transfer
 
 if TYPE_CHECKING:  # one of them is built
@@ -624,6 +628,39 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
             )
         )
     return [term for term in terms if isinstance(term, FormTerm)]
+
+
+def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
+    """Return the magnetic terms of a model with another remanence, in the applied field of a state.
+
+    Parameters
+    ----------
+    field
+        Magnetisation with this remanence. A soft material alone has no terms.
+    """
+    terms, fields = _magnetic_terms_and_fields(scene, field)
+    # fields that are known by their values have amplitudes of their own
+    for applied in fields:
+        applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
+    return terms
+
+
+def _magnetic_terms_and_fields(
+    scene: Scene, field: Magnetisation
+) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
+    """Return the magnetic terms of a remanence, and the applied fields that they read.
+
+    A soft material alone has neither; beside a remanence it is left out.
+    """
+    model, log, fields = scene.model, KernelLog(), list[AppliedField]()
+    # the factory appends to `fields` the applied fields of the terms that it makes
+    factory = replace(model.factory, log=log, fields=fields)
+    if field.soft and field.soft.alone:
+        return [], fields
+    field = replace(field, soft=None)
+    if isinstance(factory, EnergyFactory):
+        return [factory.term(energy) for energy in factory.magnetic(field)], fields
+    return factory.magnetic(field), fields
 
 
 def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:

@@ -38,6 +38,7 @@ from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.perturbation import (
+    expand_contact,
     number_at_key,
     perturbed_scene,
     scale_at_key,
@@ -47,7 +48,7 @@ from magshell_fenicsx.simulate.perturbation import (
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import expand_contact
+from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
@@ -78,7 +79,7 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
     return by_load(adjoint, name)
 
 
-def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
+def by_number(adjoint: Adjoint, key: str, scenes: SceneCache | None = None) -> float:
     """Return the derivative of a result J by a number of the case, without a solve; collective.
 
     It is a difference of the sum of J and the contracted equations between two scenes on the same
@@ -90,25 +91,22 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         J with the multipliers of its equations.
     key
         Key of the number in the case.
-    others
-        Value of the number -> scene with this value. The dictionary is filled, for further results
-        of the same scene.
+    scenes
+        Scenes on the mesh of the adjoint's scene, for further results; None: new ones.
 
     Raises
     ------
     CaseError
         If the number has no derivative here.
     """
-    others = {} if others is None else others
-    scene = adjoint.scene
+    scene, scene_cache = adjoint.scene, scenes or SceneCache(base=adjoint.scene)
     value = number_at_key(scene.problem.context, key)
     _refuse_shell_number(adjoint, key)
 
     def contracted(p: float) -> float:
         """Return J plus equations times multipliers, at fixed states, for a value of the number."""
-        if p != value and p not in others:
-            others[p] = perturbed_scene(scene, key, p)
-        return _contracted_equations(adjoint, other=scene if p == value else others[p])
+        other = scene if p == value else perturbed_scene(scene_cache, key, p)
+        return _contracted_equations(adjoint, other)
 
     return _slope(contracted, value, scale_at_key(scene.problem.context, key))
 
@@ -358,7 +356,7 @@ def gradient(
     return {name: derivative(adjoint, name) for name in ([by] if isinstance(by, str) else by)}
 
 
-def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
+def derivative(adjoint: Adjoint, by: str, scenes: SceneCache | None = None) -> Gradient:
     """Return the derivative of a result by one parameter, in the unit of the result; collective.
 
     A number of the case changes the unit of the result too, which adds a second part.
@@ -368,8 +366,8 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
     by
         Amplitude, as "lambda_m"; key of a number in the case; or field: "remanence", "magnitude",
         "thickness", "curvature" or "deviation".
-    others
-        Value of the number -> scene with this value; filled, for further results of the same scene.
+    scenes
+        Scenes on the mesh of the adjoint's scene, for further results; None: new ones.
     """
     unit_size = adjoint.size
     with contact_expanded_about(adjoint.scene, adjoint.contact_state):
@@ -379,6 +377,6 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
         if by in adjoint.state.mu:
             return unit_size * by_amplitude(adjoint, by)
         # of J times the size of its unit, by the product rule
-        return unit_size * by_number(adjoint, by, others) + adjoint.value * size_by_number(
+        return unit_size * by_number(adjoint, by, scenes) + adjoint.value * size_by_number(
             adjoint, by
         )

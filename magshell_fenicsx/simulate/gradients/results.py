@@ -22,6 +22,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
 from magshell_fenicsx.parts.shell_sections import MeshSurface
@@ -38,7 +39,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import (
     solved,
     with_begins,
 )
-from magshell_fenicsx.simulate.gradients.fields import MASS
+from magshell_fenicsx.simulate.gradients.fields import FIELDS, MASS
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, refuse_unitless
 from magshell_fenicsx.simulate.gradients.vibration import (
     FIRST_FREQUENCIES,
@@ -48,7 +49,7 @@ from magshell_fenicsx.simulate.gradients.vibration import (
     refuse_no_vibration,
     vibration,
 )
-from magshell_fenicsx.simulate.perturbation import refuse_unknown_parameters
+from magshell_fenicsx.simulate.perturbation import number_at_key
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, barrier, differentiable
 from magshell_fenicsx.simulate.scene import Scene
@@ -198,6 +199,29 @@ def refuse_no_result(
                 raise CaseError(f"{result}: has no gradient here; allowed are {allowed}")
         except CaseError as e:
             raise CaseError(f"{key}: {e}") from None
+
+
+def refuse_unknown_parameters(context: Context, names: Iterable[str], start: State) -> None:
+    """Check that gradients can be taken by fields, amplitudes and numbers with these names.
+
+    Parameters
+    ----------
+    names
+        Each is a field of `FIELDS`, an amplitude, or the key of a number.
+    start
+        State whose amplitudes are allowed.
+
+    Raises
+    ------
+    CaseError
+        If the case does not have one of them.
+    """
+    try:
+        for name in names:
+            if name not in FIELDS and name not in start.mu:
+                number_at_key(context, name)
+    except CaseError as e:
+        raise CaseError(f"gradients.by: {e}") from None
 
 
 def adjoint_at_end(

@@ -29,7 +29,8 @@ from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.solid import SolidModel
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+from magshell_fenicsx.simulate.sensitivity import sensitivities
+from magshell_fenicsx.simulate.steps import fold_at
 from magshell_fenicsx.simulate.transfer import transfer
 
 H, WIDTH = 0.05, 0.2

@@ -9,10 +9,11 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.tables import write_vectors
-from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.problem.problem import Document, Problem
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene_reuse import SceneReuse, update_fields
+from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
+from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh, update_fields
 
 STRIP = """
 shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2, \
@@ -76,12 +77,39 @@ def agree(first: Case, second: Case) -> None:
 def test_another_case_is_another_scene() -> None:
     """What is not a field in the terms, or changes more, makes a new scene."""
     case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
-    known = SceneReuse()
-    scene = known.scene_for(case.problem(), Scene(case).comm)
-    assert known.scene_for(case.problem(), scene.comm) is scene
+    known = SceneCache(overwrites=True)
+    scene = known.scene_for(case.problem())
+    assert known.scene_for(case.problem()) is scene
     for setting in ("shell.poisson_ratio=0.3", "symmetry=half", "mesh.degree=3"):
         assert not update_fields(
             scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]).problem()
         )
     bare = replace(case.problem(), document=Document())
     assert not update_fields(Scene(bare), bare)
+
+
+def test_known_values_have_their_scene() -> None:
+    """Of two scenes, where there is room for one, the latest stays."""
+    case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
+    cache, made = SceneCache(base=Scene(case), max_unknowns=0), list[float]()
+
+    def at(ratio: float) -> SceneOfProblem:
+        def problem() -> Problem:
+            made.append(ratio)
+            return case.problem().with_values({"shell.poisson_ratio": ratio})
+
+        return cache.at(ratio, problem)
+
+    assert at(0.4) is at(0.4)
+    assert at(0.3).problem.material.nu == 0.3
+    at(0.4)
+    assert made == [0.4, 0.3, 0.4]
+
+
+def test_a_mesh_that_does_not_fit() -> None:
+    """A field across the axis needs more than a meridian."""
+    base = Scene(Case.load(CASES / "dimple_buckling.yaml", BUCKLING))
+    across = Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, "magnetic.applied.polar=30"])
+    for moves_mesh, message in ((False, "breaks the symmetry"), (True, "changes on the way")):
+        with pytest.raises(UnfitMesh, match=message):
+            SceneCache(base=base, moves_mesh=moves_mesh).scene_for(across.problem())
