@@ -141,6 +141,11 @@ def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: P
     file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
 
 
+def varying_columns(rows: Sequence[Mapping[str, Any]], columns: Iterable[str]) -> list[str]:
+    """Return those of some columns that have several values in rows."""
+    return [column for column in columns if len({row[column] for row in rows}) > 1]
+
+
 def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[Read]:
     """Return what `convert` makes of each row of a CSV file, in their order.
 
