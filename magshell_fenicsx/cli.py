@@ -24,6 +24,7 @@ from magshell_fenicsx.command import (
     folder_option,
     print_line,
     result_option,
+    study_folder,
     typer,
 )
 from magshell_fenicsx.platform.interrupt import is_interrupt
@@ -213,11 +214,9 @@ def sweep(
     ] = None,
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
-    from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.sweep import sweep as run_sweep
+    from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
-    folder = chosen_folder(out, f"{case.stem}_sweep")
-    with exit_codes(stopped=(DiskError,)):
+    with study_folder(out, f"{case.stem}_sweep") as folder:
         outcome = run_sweep(
             case,
             over,
@@ -228,7 +227,6 @@ def sweep(
             full_paths=full_paths,
             part=part,
         )
-    print_line(f"results in {folder}/")
     if outcome.stopped:
         raise failure(
             f"{outcome.stopped} of {len(outcome.points)} points stopped early; sweep.csv says why",
@@ -266,16 +264,13 @@ def boundary(
     """Follow the fold or bifurcation at the end of a case in a second key, through cusps; keep
     points in the folder.
     """
-    from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
-    from magshell_fenicsx.studies.boundary_map import boundary_map
+    from magshell_fenicsx.studies.boundary.stability_map import boundary_map
 
-    folder = chosen_folder(out, f"{case.stem}_boundary")
-    with exit_codes(stopped=(DiskError, Stopped)):
+    with study_folder(out, f"{case.stem}_boundary", Stopped) as folder:
         outcome = boundary_map(
             case, over, set_ or [], folder, make_case=case_of_source, start=from_
         )
-    print_line(f"results in {folder}/")
     if outcome.stopped:
         raise failure(f"stopped early: {'; '.join(outcome.stopped)}", STOPPED)
 
@@ -300,12 +295,10 @@ def study(
     """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the
     folder.
     """
-    from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.study import parse_ranks
-    from magshell_fenicsx.studies.study import study as run_study
+    from magshell_fenicsx.studies.study.study import parse_ranks
+    from magshell_fenicsx.studies.study.study import study as run_study
 
-    folder = chosen_folder(out, f"{case.stem}_study")
-    with exit_codes(stopped=(DiskError,)):
+    with study_folder(out, f"{case.stem}_study") as folder:
         outcome = run_study(
             case,
             over,
@@ -317,7 +310,6 @@ def study(
             repeat=repeat,
             out=folder,
         )
-    print_line(f"results in {folder}/")
     if outcome.without_result:
         raise failure(
             f"{outcome.without_result} of {len(outcome.rows)} runs gave no {result}; "
@@ -362,11 +354,9 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished
     samples.
     """
-    from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.ensemble import ensemble as run_ensemble
+    from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
 
-    folder = chosen_folder(out, f"{case.stem}_ensemble")
-    with exit_codes(stopped=(DiskError,)):
+    with study_folder(out, f"{case.stem}_ensemble") as folder:
         outcome = run_ensemble(
             case,
             set_ or [],
@@ -380,11 +370,9 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             delete_weakest=delete_weakest,
             resume=resume,
         )
-    if (mean := outcome.content["mean"]) is not None:
-        print_line(
-            f"mean {result} = {mean:.6g} of {len(outcome.rows) - outcome.without_result} samples"
-        )
-    print_line(f"results in {folder}/")
+        if (mean := outcome.content["mean"]) is not None:
+            found_count = len(outcome.rows) - outcome.without_result
+            print_line(f"mean {result} = {mean:.6g} of {found_count} samples")
     if outcome.without_result:
         raise failure(
             f"{outcome.without_result} of {len(outcome.rows)} samples have no {result}; "
@@ -405,16 +393,13 @@ def design(
     """Vary a case for a result (its section `design`); write the best case, its table and picture,
     and verify it.
     """
-    from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.design import Missed
-    from magshell_fenicsx.studies.design import design as run_design
+    from magshell_fenicsx.studies.design.search import Missed
+    from magshell_fenicsx.studies.design.search import design as run_design
 
-    folder = chosen_folder(out, f"{case.stem}_design")
-    with exit_codes(stopped=(DiskError, Missed)):
+    with study_folder(out, f"{case.stem}_design", Missed) as folder:
         run_design(
             case, set_ or [], folder, make_case=shared_case_of_source, resume=resume, say=print_line
         )
-    print_line(f"results in {folder}/")
 
 
 @app.command()
@@ -429,16 +414,13 @@ def identify(
     """Find numbers of a case from measured data (its section `identify`), and how sure they are;
     keep evaluations.
     """
-    from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.simulate.record import Stopped
-    from magshell_fenicsx.studies.identify import identify as identify_parameters
+    from magshell_fenicsx.studies.identify.identification import identify as identify_parameters
 
-    folder = chosen_folder(out, f"{case.stem}_identify")
-    with exit_codes(stopped=(DiskError, Stopped)):
+    with study_folder(out, f"{case.stem}_identify", Stopped) as folder:
         outcome = identify_parameters(
             case, data, set_ or [], folder, make_case=shared_case_of_source, say=print_line
         )
-    print_line(f"results in {folder}/")
     if outcome.fit.ended != "converged":
         raise failure(f"stopped early: {outcome.fit.ended}", STOPPED)
 
@@ -463,12 +445,11 @@ def compare(
     out: Annotated[str | None, folder_option("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
-    from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.compare import NothingLeft, parse_refinements
-    from magshell_fenicsx.studies.compare import compare as run_comparison
+    from magshell_fenicsx.studies.compare.comparison import compare as run_comparison
+    from magshell_fenicsx.studies.compare.comparison import parse_refinements
+    from magshell_fenicsx.studies.compare.model_runs import NothingLeft
 
-    folder = chosen_folder(out, f"{case.stem}_compare")
-    with exit_codes(stopped=(DiskError, NothingLeft)):
+    with study_folder(out, f"{case.stem}_compare", NothingLeft) as folder:
         refinements = parse_refinements(shell, solid)
         outcome = run_comparison(
             case,
@@ -479,13 +460,12 @@ def compare(
             result=result,
             say=print_line,
         )
-    difference = outcome.content["difference"]
-    if difference is not None:
-        print_line(
-            f"{outcome.content['result']}: the solid differs from the shell by "
-            f"{100 * difference:+.3f} %"
-        )
-    print_line(f"results in {folder}/")
+        difference = outcome.content["difference"]
+        if difference is not None:
+            print_line(
+                f"{outcome.content['result']}: the solid differs from the shell by "
+                f"{100 * difference:+.3f} %"
+            )
 
 
 app.add_typer(inspection.app)

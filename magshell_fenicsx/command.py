@@ -150,6 +150,25 @@ def chosen_folder(out: str | None, default: str) -> Path:
         return Path("results") / default if out is None else user_folder(out)
 
 
+@contextmanager
+def study_folder(out: str | None, default: str, *stopped: type[Exception]) -> Iterator[Path]:
+    """Context of a study with its folder, which is printed at the end; the command gets exit codes.
+
+    Parameters
+    ----------
+    out, default
+        The folder that an option names, and its default in results/.
+    stopped
+        Exceptions of an early stop, beside that of a full disk.
+    """
+    from magshell_fenicsx.output.store.folder import DiskError
+
+    folder = chosen_folder(out, default)
+    with exit_codes(stopped=(DiskError, *stopped)):
+        yield folder
+        print_line(f"results in {folder}/")
+
+
 def picture_options(
     formats: str | None,
     width: float | None,

@@ -125,17 +125,17 @@ def check(case: CaseFile, set_: Settings = None) -> None:
                     problem, read_case.design.named_results if read_case.design else {}
                 )
         if read_case.ensemble:
-            from magshell_fenicsx.studies.samples import refuse_unknown_keys
+            from magshell_fenicsx.studies.ensemble.samples import refuse_unknown_keys
 
             refuse_unknown_keys(source, read_case.ensemble, Case.from_source)
         if read_case.design:
-            from magshell_fenicsx.studies.design_variables import refuse_unfit_numbers
+            from magshell_fenicsx.studies.design.variables import refuse_unfit_numbers
 
             with placing_messages(read_case):
                 refuse_unfit_numbers(source, read_case, read_case.design)
         if read_case.identify:
-            from magshell_fenicsx.studies.identify_data import refuse_unfit_section
-            from magshell_fenicsx.studies.identify_programmes import refuse_unfit_programmes
+            from magshell_fenicsx.studies.identify.data import refuse_unfit_section
+            from magshell_fenicsx.studies.identify.programme_input import refuse_unfit_programmes
 
             with placing_messages(read_case):
                 refuse_unfit_section(source, read_case, read_case.identify)

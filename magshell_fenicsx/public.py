@@ -26,8 +26,8 @@ from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.studies.boundary import StabilityBoundary
-    from magshell_fenicsx.studies.identify import Identified
+    from magshell_fenicsx.studies.boundary.stability_boundary import StabilityBoundary
+    from magshell_fenicsx.studies.identify.identification import Identified
 
 ProblemSource: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
@@ -146,10 +146,10 @@ def boundary(
     start: str | None = None,
 ) -> "StabilityBoundary":
     """Follow the instability at the end of a case file in a second key; see
-    `studies.boundary.boundary`.
+    `studies.boundary.stability_boundary.boundary`.
 
     With two keys in `over` it is followed in the first key for each value of the second, see
-    `studies.boundary_map.boundary_map`.
+    `studies.boundary.stability_map.boundary_map`.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def boundary(
         "DIR:POINT": the fold or bifurcation at a point of the run in a folder, which is followed
         instead. None: the instability at the end of the case.
     """
-    from magshell_fenicsx.studies.boundary_map import boundary_map
+    from magshell_fenicsx.studies.boundary.stability_map import boundary_map
 
     overs = [over] if isinstance(over, str) else over
     return boundary_map(
@@ -178,7 +178,7 @@ def identify(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
 ) -> "Identified":
-    """Find numbers of a case file from measured data, as `studies.identify.identify` does.
+    """Find numbers of a case file from measured data; see `studies.identify.identification`.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def identify(
     say
         Function that prints a line of text.
     """
-    from magshell_fenicsx.studies.identify import identify as identify_parameters
+    from magshell_fenicsx.studies.identify.identification import identify as identify_parameters
 
     return identify_parameters(
         file,

@@ -5,12 +5,14 @@ from functools import partial
 from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.studies import compare as comparisons
-from magshell_fenicsx.studies import design as designs
-from magshell_fenicsx.studies import design_variables, points, samples
-from magshell_fenicsx.studies import ensemble as ensembles
-from magshell_fenicsx.studies import study as studies
-from magshell_fenicsx.studies import sweep as sweeps
+from magshell_fenicsx.studies import points
+from magshell_fenicsx.studies.compare import comparison as comparisons
+from magshell_fenicsx.studies.design import search as designs
+from magshell_fenicsx.studies.design import variables as design_variables
+from magshell_fenicsx.studies.ensemble import ensemble as ensembles
+from magshell_fenicsx.studies.ensemble import samples
+from magshell_fenicsx.studies.study import study as studies
+from magshell_fenicsx.studies.sweep import sweep as sweeps
 
 sweep = partial(sweeps.sweep, make_case=Case.from_source)
 ensemble = partial(ensembles.ensemble, make_case=Case.from_source)

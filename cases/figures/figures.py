@@ -15,8 +15,8 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.studies.sweep import Sweep, sweep, sweep_row
-from magshell_fenicsx.studies.sweep_picture import loaded
+from magshell_fenicsx.studies.sweep.picture import loaded
+from magshell_fenicsx.studies.sweep.sweep import Sweep, sweep, sweep_row
 
 CASES = Path(__file__).parent
 OUT = Path("results") / "figures"

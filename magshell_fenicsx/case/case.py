@@ -71,8 +71,9 @@ from magshell_fenicsx.problem.requests import (
     StabilitySection,
 )
 from magshell_fenicsx.shape.reference_shell import Coordinates
-from magshell_fenicsx.studies.identify_sections import IdentifySection
-from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
+from magshell_fenicsx.studies.design.sections import DesignSection
+from magshell_fenicsx.studies.ensemble.sections import EnsembleSection
+from magshell_fenicsx.studies.identify.sections import IdentifySection
 
 if TYPE_CHECKING:
     from magshell_fenicsx.problem.problem import Problem

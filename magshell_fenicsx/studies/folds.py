@@ -23,8 +23,8 @@ from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import SceneCache, with_field_strength
 from magshell_fenicsx.simulate.transfer import chart, matching, same_mesh, transfer
-from magshell_fenicsx.studies.runner import Case
-from magshell_fenicsx.studies.samples import Values
+from magshell_fenicsx.studies.ensemble.samples import Values
+from magshell_fenicsx.studies.points import Case
 
 Array = NDArray[np.float64]
 MAX_PREDICTOR_FOLDS = 3  # folds of one continuation, for a quadratic extrapolation

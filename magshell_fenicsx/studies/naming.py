@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown_quantity
-from magshell_fenicsx.studies.points import short_key
+from magshell_fenicsx.studies.points import Axis, short_key
 
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
 NAMES = {  # words and symbol of keys
@@ -62,6 +62,14 @@ def key_label(key: str, unit: str = "") -> str:
     """Return a key and its unit as the label of an axis."""
     unit = unit or UNITS.get(key.split(".")[-1], "")
     return key_words(key, unit) + (f"  ({unit})" if unit else "")
+
+
+def axis_label(axis: Axis) -> str:
+    """Return the label of an axis of a sweep, with all its tied keys."""
+    *tied_keys, last_key = axis.keys
+    return " = ".join(
+        [*(key_words(key, axis.unit) for key in tied_keys), key_label(last_key, axis.unit)]
+    )
 
 
 def key_symbol(key: str) -> str:

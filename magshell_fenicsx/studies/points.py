@@ -1,4 +1,4 @@
-"""The points of a study: axes of `--over`, their product, each a valid case.
+"""The points of a study: cases with keys; axes of `--over`, and the points of their product.
 
 An axis is one direction of a sweep: a key of the case with its values, or several keys that are
 tied with `+` and take the same values. A point has a value for each axis. A key is a path of words
@@ -10,23 +10,42 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
-from magshell_fenicsx.studies.runner import Case, MakeCase
 
+# what the front end makes of a source; `problem()` makes its problem: a study does not know its
+# class
+Case = Any
+MakeCase = Callable[[Source], Case]
 MOST_POINTS = 10_000
 FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
+
+
+class StudyPoint(Protocol):
+    """A point of a study: one of its cases."""
+
+    @property
+    def case(self) -> Case:
+        """The validated case."""
+
+    @property
+    def key(self) -> str:
+        """Name of its outcome; equal problems have equal keys."""
+
+    @property
+    def label(self) -> str:
+        """The point in words, on a line of its own when it is computed."""
 
 
 @dataclass(frozen=True)
@@ -195,6 +214,19 @@ class SweepPoint:
     def label(self) -> str:
         """Keys and values in words, for example `energy=full, remanent.polar=45`."""
         return ", ".join(f"{short_key(key)}={value}" for key, value in self.values.items())
+
+
+def point_columns(axes: Sequence[Axis], point: SweepPoint) -> dict[str, Any]:
+    """Return the columns of a point in a table: swept keys, their numbers, and `point`, its key.
+
+    Values that have a unit are text as in the case file; their numbers have the unit in the name of
+    the column, `key_unit`.
+    """
+    columns: dict[str, Any] = {**point.values, "point": point.key}
+    for axis in axes:
+        if axis.unit and axis.numbers:
+            columns |= {f"{key}_{axis.unit}": axis.number(point.values[key]) for key in axis.keys}
+    return columns
 
 
 def make_points(source: Source, axes: Sequence[Axis], make_case: MakeCase) -> list[SweepPoint]:

@@ -1,157 +1,32 @@
-"""One runner for many runs: cases in, outcomes and a table out.
+"""One runner for many runs: it deals tasks to the ranks, and says how far they are.
 
-A study says which runs there are. The runner opens its folder, keeps every outcome in a file as
-soon as it is there, deals the missing runs to the ranks, and says how far it is. What these sources
-have kept is not computed again.
-
-A study is any command that runs a case many times, such as a sweep. A case is what the front end
-makes of a source (a case file with settings). An outcome is what a run leaves; it is found along
-its path, or as a fold that is followed from another run. A knockdown k_d is the pressure of the
-first fold over the classical one. A scalar is a named number of a run. A task is a run, or several
-that belong together. `say` prints a line.
+A study is any command that runs a case many times, such as a sweep. A point is one of its cases. An
+outcome is what is computed at a point; it is kept as soon as it is there (`OutcomeStore`), so that
+an interrupted study goes on. A task is a point, or several that belong together. `say` prints a
+line.
 """
 
-import json
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, Literal, TypeVar
-from uuid import uuid4
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
-from pydantic import TypeAdapter
 
-from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.output.store.durable import write_object
-from magshell_fenicsx.output.store.folder import (
-    DiskError,
-    locked_folder,
-    prepare_folder,
-    refuse_other_tables,
-)
-from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.store.folder import DiskError
 from magshell_fenicsx.platform import terminal
-from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.runs.status import clock
-from magshell_fenicsx.runs.summary import Result, in_units, snaps
-from magshell_fenicsx.studies.results import Scalar
+from magshell_fenicsx.studies.store import OutcomeStore, OutcomeType, PointType
 
-# what the front end makes of a source; `problem()` makes its problem: a study does not know its
-# class
-Case = Any
-MakeCase = Callable[[Source], Case]
 Say = Callable[[str], None]
-OutcomeType = TypeVar("OutcomeType")
 Task = TypeVar("Task")
-OutcomeOrigin = Literal["path", "fold"]
-FAILED = "failed: "  # what `stopped` begins with if an error ended the run
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
 SECONDS_BETWEEN_LINES = terminal.STATUS_SECONDS  # s
-
-
-@dataclass(frozen=True)
-class Folder:
-    """The files of a kind of study, such as a sweep, in its folder.
-
-    Attributes
-    ----------
-    what
-        Its name in messages: "an ensemble".
-    tables
-        Names of the files that the study writes; the first is a JSON object.
-    keys
-        Keys of that object, by which a folder of such a study is recognised.
-    points
-        Subfolder of the outcomes.
-    first
-        A table that is created empty at the start, so that an unwritable folder is refused at once.
-    """
-
-    what: str
-    tables: tuple[str, ...]
-    keys: tuple[str, ...]
-    points: str = "points"
-    first: str = ""
-
-    def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
-        """Make the folder, and return its path; collective. Several jobs may prepare the same one.
-
-        Parameters
-        ----------
-        case
-            Name of the case file; "" if it does not matter.
-
-        Raises
-        ------
-        CaseError
-            On every rank, if the folder has files of others or tables of another case file, or
-            cannot be written.
-        """
-
-        def make(folder: Path) -> None:
-            """Check the folder and make it; called on rank 0."""
-            refuse_other_tables(folder, self.tables, self.keys, self.what, case)
-            for directory in (folder, folder / self.points):
-                directory.mkdir(parents=True, exist_ok=True)
-            if self.first:
-                (folder / self.first).touch()
-
-        return prepare_folder(out, comm, make)
-
-    @contextmanager
-    def locked(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
-        """Prepare the folder and lock it for this job inside `with`; collective."""
-        with locked_folder(out, comm, make=True):
-            self.prepare(out, comm, case)
-            yield
-
-
-def keep(file: Path, content: Mapping[str, Any]) -> None:
-    """Write an outcome as a JSON file.
-
-    A killed study leaves the complete file or none: it is written under another name, and renamed.
-    Two processes may write the same file.
-
-    Raises
-    ------
-    DiskError
-        For instance if the disk is full; earlier files are kept.
-    """
-    unfinished = file.with_suffix(f".{uuid4().hex}")
-    try:
-        write_object(unfinished, content)
-        unfinished.replace(file)
-    except OSError as e:
-        raise DiskError(f"{file} cannot be written: {e.strerror}") from e
-
-
-def stored_outcome(
-    file: Path, kind: TypeAdapter[OutcomeType], key: str = "", **same: Any
-) -> OutcomeType | None:
-    """Return the outcome in a JSON file, validated as `kind`.
-
-    None if there is no file, it is damaged, or it has other values than `same`.
-
-    Parameters
-    ----------
-    key
-        Key of the outcome in the file; "" for the whole content.
-    same
-        Keys of the file with the values that they must have.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        if any(content[name] != value for name, value in same.items()):
-            return None
-        return kind.validate_python(content[key] if key else content)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
 
 
 def _are_of_part(first: str, number: str, count: int) -> bool:
@@ -223,6 +98,43 @@ def compute(
             for line in do(tasks[i]):
                 done_count = i + 1  # on all ranks together, since tasks are dealt in order
                 progress(line + remaining_text())
+
+
+def say_on_first_rank(say: Say, comm: MPI.Comm) -> Say:
+    """Return `say` on rank 0, and a function that says nothing on other ranks."""
+    return say if comm.rank == 0 else lambda line: None
+
+
+def compute_points(
+    points: Sequence[PointType],
+    compute_point: Callable[[PointType], OutcomeType],
+    store: OutcomeStore[OutcomeType],
+    comm: MPI.Intracomm,
+    say: Say,
+    words: Callable[[OutcomeType], str] = str,
+) -> None:
+    """Compute points, each on the next free rank, and keep their outcomes; collective.
+
+    Parameters
+    ----------
+    points
+        Points with different keys, such as those that a store is missing.
+    compute_point
+        Returns the outcome of a point; called on one rank.
+    say
+        Called with a line for each point, on the rank that computed it.
+    words
+        Returns an outcome in words, for this line.
+    """
+    numbers = {point.key: number for number, point in enumerate(points, 1)}
+
+    def point_computed(point: PointType) -> Iterator[str]:
+        """Compute a point on this rank, keep its outcome, and yield a line of text."""
+        outcome = compute_point(point)
+        store.keep(point.key, outcome, point.case)
+        yield f"{numbers[point.key]:5d}/{len(points)}  {point.label}: {words(outcome)}"
+
+    compute(points, point_computed, comm, say)
 
 
 class Heard:
@@ -381,170 +293,3 @@ def _wait_for_all(comm: MPI.Intracomm) -> Iterator[None]:
         )
         comm.Abort(code)
     comm.Barrier()
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The outcome of a run, or of a fold that was followed from another run.
-
-    Attributes
-    ----------
-    knockdown
-        k_d; None if there is no instability under pressure.
-    limit
-        The first limit point (the one of k_d) as in summary.json, or the event that ends a motion;
-        None without.
-    stopped
-        Why the run ended before its target; None if it reached it.
-    dofs
-        Number of unknowns; None for a run that failed.
-    wall_s
-        Wall time.
-    curve
-        Every accepted point, with the columns of path.csv.
-    found
-        "path": the full path was computed; "fold": the fold of another run was followed, and the
-        curve has only this point.
-    factorisations
-        Factorisations of the model's tangent, including failed attempts; without those for excluded
-        modes.
-    barrier
-        The energy barrier over E h R²; None if the case does not ask for one.
-    cpu_s
-        CPU time of a sample of an ensemble.
-    in_units
-        Numbers of a case with units, as in summary.json.
-    snaps
-        As in summary.json.
-    """
-
-    knockdown: float | None
-    limit: dict[str, Any] | None
-    stopped: str | None
-    dofs: int | None
-    wall_s: float
-    curve: list[Row]
-    found: OutcomeOrigin
-    factorisations: int
-    barrier: float | None = None
-    cpu_s: float = 0.0
-    in_units: dict[str, float] = field(default_factory=dict)
-    snaps: list[dict[str, Any]] = field(default_factory=list)
-
-    @classmethod
-    def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
-        """Return the outcome of a run without a result, for a reason."""
-        return cls(None, None, why, None, wall_s, [], "path", factorisations)
-
-    def value(self, scalar: Scalar) -> float | None:
-        """Return a named number of the run; None if the run does not have it."""
-        if not self.curve:  # a failed run
-            return None
-        # summary.json, as far as a scalar reads it
-        summary = {
-            "knockdown": self.knockdown,
-            "barrier": self.barrier,
-            "limit_points": [self.limit] if self.limit else [],
-            "snaps": self.snaps,
-        }
-        # rows as texts, as in path.csv
-        rows = [_texts_of(row) for row in self.curve]
-        return scalar.value_in(summary, rows)
-
-    def serves(self, scalar: Scalar) -> bool:
-        """Return whether the outcome is enough for a number.
-
-        A fold alone has the knockdown only. A path must have the columns of the number.
-        """
-        if scalar.name == "knockdown":
-            return True
-        if self.found != "path":
-            return False
-        needed = {scalar.column, scalar.at} & set(COLUMNS)  # those that an outcome may leave out
-        return not self.curve or needed <= self.curve[0].keys()
-
-
-OUTCOME = TypeAdapter(Outcome)
-
-
-def _texts_of(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return the values of a row as texts."""
-    return {key: str(v) for key, v in row.items()}
-
-
-def _kept_part(row: Row, kept_columns: Iterable[str]) -> Row:
-    """Return those of some columns that a row has, without numbers of numpy."""
-    return {
-        key: v if isinstance(v := row[key], str | int) else float(v)
-        for key in kept_columns
-        if key in row
-    }
-
-
-def outcome_of(
-    result: Result,
-    origin: OutcomeOrigin,
-    factorisations: int,
-    wall_s: float = 0.0,
-    columns: Sequence[str] = COLUMNS,
-) -> Outcome:
-    """Return the outcome of a run, or of a fold in the form of a run.
-
-    Parameters
-    ----------
-    origin
-        "path" for a run, "fold" for a fold that was followed.
-    columns
-        Columns of path.csv that the curve keeps, beside those that the scene adds.
-    """
-    # the limit point of k_d first, as `False` is sorted before `True`; the others stay in order
-    limit_points = sorted(
-        result.limit_points,
-        key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
-    )
-    # columns of the curve, each once and in order
-    kept_columns = dict.fromkeys((*columns, *result.scene.extra_columns))
-    return Outcome(
-        knockdown=result.knockdown,
-        limit=next(iter(limit_points), None) or _event(result),
-        stopped=result.stopped,
-        dofs=result.scene.model.system.dofs,
-        wall_s=round(wall_s, 3),
-        curve=[_kept_part(row, kept_columns) for row in result.rows],
-        found=origin,
-        factorisations=factorisations,
-        barrier=result.barrier,
-        in_units=in_units(result),
-        snaps=snaps(result.rows) if origin == "path" else [],  # a fold alone has no path
-    )
-
-
-def _event(result: Result) -> dict[str, Any] | None:
-    """Return the point at which an event or an instability ended a motion, as a limit point.
-
-    None if the run ended otherwise.
-    """
-    last_row, steps = result.rows[-1], result.scene.problem.programme
-    # what ends the last step; only a motion in time has the amplitude "time"
-    until = getattr(steps[-1].load, "until", "") if steps else ""
-    if result.stopped or last_row["amplitude"] != "time":
-        return None
-    if until not in ("event", "instability"):
-        return None
-    common = {key: last_row[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
-    return {**common, "kind": until, "mode": "", "value": last_row["time"]}
-
-
-def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
-    """Write the outcome of a case, with the case and the version of the sources."""
-    origin = {
-        "case": case.model_dump(mode="json", exclude_none=True),
-        **case.outside,
-        "sources": code_version(),
-    }
-    keep(file, {**origin, "outcome": asdict(outcome)})
-
-
-def stored_outcome_of_case(file: Path) -> Outcome | None:
-    """Return the outcome in a file of a case; None unless the present sources have computed it."""
-    return stored_outcome(file, OUTCOME, "outcome", sources=code_version())

@@ -14,7 +14,7 @@ from scipy import stats
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.chance import DistributionSection, NoRoom, generator, random_places
-from magshell_fenicsx.studies.sections import EnsembleSection
+from magshell_fenicsx.studies.ensemble.sections import EnsembleSection
 
 SPREAD = np.sqrt(
     np.log(1 + 0.5**2)

@@ -9,7 +9,7 @@ from conftest import CASES
 import magshell_fenicsx as ms
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import problem_on_moved_mesh
-from magshell_fenicsx.studies.boundary_picture import _regions
+from magshell_fenicsx.studies.boundary.picture import _regions
 
 
 def test_deeper_caps_buckle_before_they_snap(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def a_folder(out: Path) -> None:
     ):
         ms.run(case, out / "run", COMM, resume=True)
     with (
-        patch("magshell_fenicsx.studies.sweep.stored_outcome_of_case", failing(KeyError("a bug"))),
+        patch("magshell_fenicsx.studies.store.OutcomeStore.outcome", failing(KeyError("a bug"))),
         raised(KeyError, "a bug"),
     ):
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)

@@ -17,7 +17,7 @@ from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_f
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.folds import Continuation
-from magshell_fenicsx.studies.runner import Outcome
+from magshell_fenicsx.studies.outcome import Outcome
 
 DIMPLE, COPLANAR = CASES / "dimple_buckling.yaml", CASES / "figures" / "coplanar.yaml"
 COARSE = ["mesh.degree=3", "mesh.refinement=0.4"]

@@ -22,7 +22,7 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import problem_on_moved_mesh
-from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
+from magshell_fenicsx.studies.boundary.picture import _regions, draw_map
 
 
 def coarse() -> Path:

@@ -23,7 +23,8 @@ from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.scene_cache import SceneCache
-from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
+from magshell_fenicsx.studies.design.evaluation import DesignEvaluation, evaluate
+from magshell_fenicsx.studies.design.variables import controls_of
 
 Array = NDArray[np.float64]
 STRIP = """
@@ -56,6 +57,17 @@ def rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
+@pytest.mark.parametrize(("settings", "most"), [([], 401), (["magnetic.remanent.polar=45"], 1681)])
+def test_more_points_than_places(settings: list[str], most: int) -> None:
+    """The meridian and the surface have so many places; each is one control point, with a vector,
+    at a distance from the next.
+    """
+    case = Case.load(CASES / "dimple_buckling.yaml", ["magnetic.lambda_m=0.00184", *settings])
+    controls, vectors = controls_of(case, 2000, None, "design.remanence")
+    assert len(controls.places) == len(vectors) == most
+    assert controls.width > 0
+
+
 @pytest.mark.slow
 def test_reach_interrupt_and_resume(
     strip: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -63,7 +75,7 @@ def test_reach_interrupt_and_resume(
     """An interrupted design ends as one that was not; its best case runs as it is, to the same
     number.
     """
-    case, room = strip(TURN), import_module("magshell_fenicsx.studies.design")
+    case, room = strip(TURN), import_module("magshell_fenicsx.studies.design.search")
     evaluate, count = room.evaluate, [0]
 
     def stopping(*arguments: object) -> object:

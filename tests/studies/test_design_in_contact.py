@@ -14,8 +14,8 @@ from sheets import Sheet, write
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.simulate.scene_cache import SceneCache
-from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
-from magshell_fenicsx.studies.design_variables import variables
+from magshell_fenicsx.studies.design.evaluation import DesignEvaluation, evaluate
+from magshell_fenicsx.studies.design.variables import variables
 
 h = 0.02
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from magshell_fenicsx.studies.design_picture import ReachedShape, draw_design
+from magshell_fenicsx.studies.design.picture import ReachedShape, draw_design
 
 MANY = [
     "buckling_pressure_Pa",

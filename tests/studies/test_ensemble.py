@@ -18,12 +18,12 @@ from magshell_fenicsx import CaseError
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import override, read_source
 from magshell_fenicsx.public import run
-from magshell_fenicsx.studies import ensemble as solving
+from magshell_fenicsx.studies.ensemble import ensemble as solving
+from magshell_fenicsx.studies.ensemble.samples import Sample
+from magshell_fenicsx.studies.ensemble.statistics import make_row
 from magshell_fenicsx.studies.folds import KnownFolds
+from magshell_fenicsx.studies.outcome import Outcome
 from magshell_fenicsx.studies.results import parse_scalar
-from magshell_fenicsx.studies.runner import Outcome
-from magshell_fenicsx.studies.samples import Sample
-from magshell_fenicsx.studies.statistics import make_row
 
 DIMPLE = CASES / "dimple_buckling.yaml"
 RANDOM = (

@@ -6,8 +6,8 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
-from magshell_fenicsx.studies.ensemble_picture import draw_ensemble
-from magshell_fenicsx.studies.statistics import RESULT
+from magshell_fenicsx.studies.ensemble.picture import draw_ensemble
+from magshell_fenicsx.studies.ensemble.statistics import RESULT
 
 
 @pytest.mark.parametrize(

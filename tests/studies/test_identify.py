@@ -21,7 +21,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import read_rows
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.simulate.readings import Reading, read
-from magshell_fenicsx.studies.laplace import Measured, fit_posterior
+from magshell_fenicsx.studies.identify.laplace import Measured, fit_posterior
 
 Array = NDArray[np.float64]
 LOOKED_FOR = """

@@ -7,7 +7,7 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.laplace import (
+from magshell_fenicsx.studies.identify.laplace import (
     NORMAL,
     Measured,
     NoNoise,
@@ -16,7 +16,7 @@ from magshell_fenicsx.studies.laplace import (
     fit_posterior,
     nonlinearity,
 )
-from magshell_fenicsx.studies.smooth import Smooth
+from magshell_fenicsx.studies.identify.smoothness_prior import Smooth
 
 Array = NDArray[np.float64]
 T = np.linspace(0.2, 3.0, 12)

@@ -1,5 +1,5 @@
 """The lowest of several values raised: by linear programs of all planes that were seen
-(studies/max_min.py).
+(studies/design/max_min.py).
 """
 
 from collections.abc import Callable
@@ -10,8 +10,8 @@ import pytest
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.design_evaluation import DesignEvaluation
-from magshell_fenicsx.studies.max_min import raise_lowest
+from magshell_fenicsx.studies.design.evaluation import DesignEvaluation
+from magshell_fenicsx.studies.design.max_min import raise_lowest
 
 Array = NDArray[np.float64]
 OBSERVABLES = 3  # of the values the lowest ones

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene_cache import SceneCache
-from magshell_fenicsx.studies.design_evaluation import evaluate
+from magshell_fenicsx.studies.design.evaluation import evaluate
 
 Array = NDArray[np.float64]
 STRIP = """

@@ -28,11 +28,11 @@ from magshell_fenicsx.platform import environment
 from magshell_fenicsx.platform.processes import Usage
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
-from magshell_fenicsx.studies import compare as runs
-from magshell_fenicsx.studies import measured as sample
-from magshell_fenicsx.studies import sweep as chain
+from magshell_fenicsx.studies.compare import model_runs as runs
 from magshell_fenicsx.studies.results import parse_scalar
-from magshell_fenicsx.studies.study import _outcome
+from magshell_fenicsx.studies.study import timings as sample
+from magshell_fenicsx.studies.study.study import _outcome
+from magshell_fenicsx.studies.sweep import chains as chain
 
 PACKAGE, BUCKLING = Path(magshell_fenicsx.__file__).parent, CASES / "dimple_buckling.yaml"
 QUICK = ["mesh.degree=3", "mesh.refinement=0.3"]

@@ -15,7 +15,7 @@ from many import make_samples
 from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import run
-from magshell_fenicsx.studies.samples import Sample
+from magshell_fenicsx.studies.ensemble.samples import Sample
 
 CAP = {
     "geometry": "cap",

@@ -15,12 +15,12 @@ from many import make_points, study
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.platform.processes import Usage, measure
-from magshell_fenicsx.studies import measured as sample
-from magshell_fenicsx.studies.measured import TIMES, Timings
 from magshell_fenicsx.studies.points import parse_axes
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
-from magshell_fenicsx.studies.study import parse_ranks
-from magshell_fenicsx.studies.study_report import Run, estimated_error, make_rows
+from magshell_fenicsx.studies.study import timings as sample
+from magshell_fenicsx.studies.study.report import Run, estimated_error, make_rows
+from magshell_fenicsx.studies.study.study import parse_ranks
+from magshell_fenicsx.studies.study.timings import TIMES, Timings
 
 DIMPLE, PLATE = CASES / "dimple_buckling.yaml", CASES / "clamped_plate.yaml"
 K_D = 0.326233289  # axisymmetric solver, nine digits

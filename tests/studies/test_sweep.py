@@ -18,9 +18,10 @@ from magshell_fenicsx.input.section import number_and_unit
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.public import run
 from magshell_fenicsx.studies import points as axes_module
-from magshell_fenicsx.studies import sweep as module
-from magshell_fenicsx.studies import sweep_picture as sweep_plot
+from magshell_fenicsx.studies.figures import is_map
 from magshell_fenicsx.studies.points import SweepPoint, parse_axes
+from magshell_fenicsx.studies.sweep import chains
+from magshell_fenicsx.studies.sweep import sweep as module
 
 PLATE, DIMPLE, POLE = (
     CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation")
@@ -53,7 +54,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         done.append(problem.document.data["loading"]["pressure"])
         return run(problem, comm=comm)
 
-    monkeypatch.setattr(module, "run", counted)
+    monkeypatch.setattr(chains, "run", counted)
     return done
 
 
@@ -309,8 +310,8 @@ def test_two_numbers_are_a_map() -> None:
     )
     lengths = parse_axes(["shell.radius=25 mm,3 cm,0.04 m"])[0]
     assert lengths.numbers == [25, pytest.approx(30), pytest.approx(40)]
-    assert sweep_plot._is_map([three, lengths])
-    assert not any(sweep_plot._is_map([three, each]) for each in (two, words))
+    assert is_map([three, lengths])
+    assert not any(is_map([three, each]) for each in (two, words))
 
 
 def test_equal_problems_are_computed_once(tmp_path: Path, computed: list[float]) -> None:
@@ -382,6 +383,13 @@ def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
                     assert float(b[key]) == pytest.approx(float(a[key]), rel=1e-9, abs=1e-12)
                 except ValueError:
                     assert b[key] == a[key]
+    none = magshell(
+        *("sweep", POLE, *over, *(f"--set={s}" for s in COARSE), "--out", tmp_path / "2"),
+        *("--result", "critical_field"),
+        ranks=2,
+    )
+    assert none.returncode == 3
+    assert "4 of 4 points gave no critical_field; sweep.csv says why" in none.stderr
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from magshell_fenicsx.studies.statistics import correlations, counts, distance, fit, intervals
+from magshell_fenicsx.studies.ensemble.statistics import (
+    correlations,
+    counts,
+    distance,
+    fit,
+    intervals,
+)
 
 SHAPE, LOCATION, SCALE = 4.0, 0.3, 0.4
 

@@ -24,7 +24,6 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +50,7 @@ from magshell_fenicsx.output.pictures.lines import (
 from magshell_fenicsx.output.pictures.rendering import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, colour_map, from_zero
 from magshell_fenicsx.output.store.stored_results import headline, pole_of, style_of
-from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows, varying_columns
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude, quantity
@@ -316,12 +315,6 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps + share)])
 
 
-def _varies(column: str, rows: Sequence[Row]) -> bool:
-    """Return whether a column has several values in some rows; not if it has nan, as of a solid."""
-    values = {float(row[column]) for row in rows}
-    return len(values) > 1 and not any(map(isnan, values))
-
-
 def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[str, Any]:
     """Return the path for the page: varying columns of path.csv, labels and curves.
 
@@ -349,9 +342,8 @@ def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[
         quantities |= {q.name: q for q in axes_for(step)}
         axes += [q.name for q in axes_for(step)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
-    varying = [name for name in numeric if _varies(name, rows)]
     columns = {}
-    for name in dict.fromkeys([*axes, *varying]):
+    for name in dict.fromkeys([*axes, *varying_columns(rows, numeric)]):
         column_quantity = quantities.get(name) or quantity(name)
         values = [row[name] for row in rows]
         columns[name] = {

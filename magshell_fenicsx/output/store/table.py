@@ -150,6 +150,11 @@ def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: P
     write_whole(file, table_text([columns, *lines]).encode())
 
 
+def varying_columns(rows: Sequence[Mapping[str, Any]], columns: Iterable[str]) -> list[str]:
+    """Return those of some columns that have several values in rows."""
+    return [column for column in columns if len({row[column] for row in rows}) > 1]
+
+
 def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[Read]:
     """Return what `convert` makes of each row of a CSV file, in their order.
 

@@ -1,0 +1,1 @@
+"""Boundaries of stability: an instability that is followed in a second key of the case."""

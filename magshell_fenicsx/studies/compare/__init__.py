@@ -1,0 +1,1 @@
+"""Comparisons of a case as a shell and as a solid."""

@@ -1,0 +1,1 @@
+"""Designs: a case that an optimiser varies for a result."""

@@ -1,0 +1,1 @@
+"""Ensembles: random samples of a case and their statistics."""

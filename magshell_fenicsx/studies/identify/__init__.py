@@ -1,0 +1,1 @@
+"""Identification: parameters of a case from measured data, and predictions with bands."""

@@ -1,0 +1,1 @@
+"""Studies of error against run time, over meshes, degrees, models and ranks."""

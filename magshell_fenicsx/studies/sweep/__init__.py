@@ -1,0 +1,1 @@
+"""Sweeps: a case over ranges of its keys."""
