@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 CONTACT_DEPTH = 2e-3
 NEAR_CONTACT = 4.0  # of `CONTACT_DEPTH`: from so near a step leads past the first contact
 MAX_GAP_EVALUATIONS = 40  # on the way of a step
-DEEP_RATIO = 2.0  # penetration at a prediction over that at its point, above which it is deep
+DEEP_RATIO = 4.0  # penetration at a prediction over that at its point, above which it is deep
 
 
 def first_contact(
