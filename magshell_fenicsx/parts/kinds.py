@@ -47,7 +47,9 @@ def section_of(package: str, kind: str) -> type[Section]:
     # classes that the module itself defines; `isinstance` would import a lazy module
     classes = [member for member in vars(module).values() if issubclass(type(member), type)]
     own_classes = [member for member in classes if member.__module__ == module.__name__]
-    sections: list[type[Section]] = [each for each in own_classes if issubclass(each, Section)]
+    sections: list[type[Section]] = [
+        member for member in own_classes if issubclass(member, Section)
+    ]
     # the values of the key's Literal are the kinds of the class: one class has this kind
     (section,) = (
         member for member in sections if kind in get_args(member.model_fields[key].annotation)
@@ -143,10 +145,10 @@ class LawChoice(Section):
 def _optional_key(section: type[LawSection], key: str) -> tuple[Any, Any]:
     """Return type and default of a law's key where a shell may be without it."""
     field = section.model_fields[key]
-    given: Any = (
+    annotation: Any = (
         Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     )
-    return given | None, Field(default=None, description=meaning(section, key))
+    return annotation | None, Field(default=None, description=meaning(section, key))
 
 
 if TYPE_CHECKING:
