@@ -66,7 +66,7 @@ class StrainEnergy:
         if is_expression(first):
             symbols, derivatives = _symbolic_derivatives(self.function, len(self.constants))
             values = dict(zip(symbols, (first, second, *self.constants), strict=True))
-            return EnergyDerivatives._make(ufl.replace(each, values) for each in derivatives)
+            return EnergyDerivatives._make(ufl.replace(formula, values) for formula in derivatives)
         places = np.stack([np.ravel(first), np.ravel(second), np.zeros(np.size(first))], axis=-1)
         x, y, _ = Taylor.coordinates(places)
         energy, shape = self.value(x, y), np.shape(first)
@@ -74,7 +74,8 @@ class StrainEnergy:
             tensor.reshape(*tensor.shape[:-1], *shape)
             for tensor in (energy.gradient, energy.hessian)
         )
-        return EnergyDerivatives(*gradient[:2], hessian[0, 0], hessian[0, 1], hessian[1, 1])
+        slopes = gradient[0], gradient[1]
+        return EnergyDerivatives._make([*slopes, hessian[0, 0], hessian[0, 1], hessian[1, 1]])
 
 
 @cache
@@ -99,7 +100,7 @@ def _symbolic_derivatives(
     x, y = symbols[:2]
     by_x, by_y = (ufl.diff(function(*symbols), invariant) for invariant in (x, y))
     derivatives = by_x, by_y, ufl.diff(by_x, x), ufl.diff(by_x, y), ufl.diff(by_y, y)
-    return symbols, [ufl.algorithms.expand_derivatives(each) for each in derivatives]
+    return symbols, [ufl.algorithms.expand_derivatives(formula) for formula in derivatives]
 
 
 def is_expression(x: Scalar) -> bool:

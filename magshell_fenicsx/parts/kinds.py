@@ -114,10 +114,10 @@ class LawChoice(Section):
 def _optional_key(section: type[LawSection], key: str) -> tuple[Any, Any]:
     """Return type and default of a law's key where a shell may be without it."""
     field = section.model_fields[key]
-    given: Any = (
+    annotation: Any = (
         Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     )
-    return given | None, Field(default=None, description=meaning(section, key))
+    return annotation | None, Field(default=None, description=meaning(section, key))
 
 
 if TYPE_CHECKING:

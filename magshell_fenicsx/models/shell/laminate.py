@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Scalar, Tensor, lower_index
+from magshell_fenicsx.models.shell.law import Components, Koiter, Law, Tensor, lower_index
+from magshell_fenicsx.models.strain_energy import Scalar
 
 Array = NDArray[np.float64]
 DIRECTION_TOLERANCE = 1e-6  # of directions

@@ -214,13 +214,13 @@ class Rubber(Incompressible):
         energy = self.energy.derivatives(surface.first, surface.second)
         second_derivatives = energy.first_first, energy.first_second, energy.second_second
 
-        def product(left: tuple[Scalar, Scalar], right: tuple[Scalar, Scalar]) -> Scalar:
+        def product(row: tuple[Scalar, Scalar], column: tuple[Scalar, Scalar]) -> Scalar:
             """Return the second derivatives contracted with factors of I1':K/2 and I2':K/2."""
             first_first, first_second, second_second = second_derivatives
             return (
-                first_first * left[0] * right[0]
-                + first_second * (left[0] * right[1] + left[1] * right[0])
-                + second_second * left[1] * right[1]
+                first_first * row[0] * column[0]
+                + first_second * (row[0] * column[1] + row[1] * column[0])
+                + second_second * row[1] * column[1]
             )
 
         # factors of T, then of tr K, in I1':K/2 and I2':K/2
