@@ -8,7 +8,7 @@ import gc
 import os
 import signal
 
-INTERRUPTED = 130  # exit code
+from magshell_fenicsx.platform.interrupt import INTERRUPTED
 
 
 def main() -> None:

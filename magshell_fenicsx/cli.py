@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 from magshell_fenicsx import inspection
 from magshell_fenicsx.command import (
-    INTERRUPTED,
     INVALID,
     STOPPED,
     CaseFile,
@@ -27,7 +26,7 @@ from magshell_fenicsx.command import (
     study_folder,
     typer,
 )
-from magshell_fenicsx.platform.interrupt import is_interrupt
+from magshell_fenicsx.platform.interrupt import INTERRUPTED, is_interrupt
 from magshell_fenicsx.platform.packages import Unusable, install_hint
 from magshell_fenicsx.platform.processes import world
 from magshell_fenicsx.platform.terminal import open_standard_streams

@@ -29,7 +29,7 @@ finally:
     if _without_rich:
         del sys.modules["rich"]
 
-INVALID, STOPPED, INTERRUPTED = 2, 3, 130  # exit codes
+INVALID, STOPPED = 2, 3  # exit codes, beside `INTERRUPTED`
 FAILURE_TAG = 32101  # tag of the messages between ranks that fail
 MAX_DELAY_OF_ERRORS = 5.0  # s in which an error of all ranks reaches the last of them
 DELIVERY_TIME = 0.2  # s in which a message is on its way to the terminal

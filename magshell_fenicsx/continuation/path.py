@@ -491,18 +491,25 @@ class Path:
         """
         if self.control != "arc":
             return point
-        rate = self.metric.inner(base.normal, (point.du, point.dmu))
-        return point.with_tangent_per(rate)
+        return point.with_tangent_per(self._rate(base, point))
+
+    def _rate(self, base: Point, point: Point) -> float:
+        """Return the change of arc length, measured from `base`, along the tangent at a point."""
+        return self.metric.inner(base.normal, (point.du, point.dmu))
 
     def base_before(self, low: Point, high: Point) -> Point:
         """Return the first of two points as the base from which the second is measured.
 
         Where the path turns by more than 90 degrees between them, arc length along the first
-        tangent would fall; it is measured along the displacement du alone.
+        tangent would fall; it is measured along the displacement du alone. This does not measure a
+        second point at which only a body moves.
         """
-        if self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0:
-            return self._measured_along_displacement(low)
-        return low
+        if self.control != "arc" or self._rate(low, high) > 0:
+            return low
+        along_displacement = self._measured_along_displacement(low)
+        if self._rate(along_displacement, high):
+            return along_displacement
+        return replace(low, across=None)
 
     def _measured_along_displacement(self, point: Point) -> Point:
         """Return a point with arc length along its displacement du, not its tangent (du, dmu).

@@ -332,8 +332,8 @@ class Ability:
     """The base of what adds something to a problem, mostly a section of the case file.
 
     The methods are called while a case becomes a problem; by default they add nothing. A subclass
-    that is no section finds itself in a case by `from_context`. All subclasses stand in `ABILITIES`
-    of `registered.py`.
+    that is no section finds itself in a case by `from_context`. All subclasses are lines of
+    `REGISTERED` in `registry.py`.
     """
 
     @classmethod

@@ -3,6 +3,8 @@
 A library may raise an error of its own in place of the interrupt, which is then its cause.
 """
 
+INTERRUPTED = 130  # exit code of a program that an interrupt ends
+
 
 def is_interrupt(error: BaseException) -> bool:
     """Return whether an error was caused by KeyboardInterrupt, directly or through other errors."""

@@ -116,12 +116,12 @@ def _law_text(context: Context) -> str:
 
 def _body_text(body: SolidBody, law: LawSection) -> str:
     """Return a phrase about the law and the elements of a solid, whose shell has a law."""
-    assert law.in_solid
+    assert law.solid_law
     material, count = body.material, len(body.layer_bounds) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
-    numbers_text = law.in_solid.numbers_text
-    energy_text = f"{law.in_solid.title} energy{', ' * bool(numbers_text)}{numbers_text}"
+    numbers_text = law.solid_law.numbers_text
+    energy_text = f"{law.solid_law.title} energy{', ' * bool(numbers_text)}{numbers_text}"
     return (
         f"{energy_text}, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"
     )

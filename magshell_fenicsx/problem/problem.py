@@ -84,7 +84,7 @@ def solid_body_of(context: Context) -> SolidBody | None:
     if not context.solid:
         return None
     shell, bulk_to_shear = context.shell, _solid_section(context).bulk_to_shear
-    law = shell.law_section.in_solid
+    law = shell.law_section.solid_law
     assert law  # another law needs a mid-surface
     return SolidBody(
         CompressibleRubber.from_poisson_ratio(

@@ -9,7 +9,7 @@ Words and symbols:
 - A remark is a sentence that the result must not be read without.
 - Excluded modes break a symmetry that the reduced model has. Behind a bifurcation into one of them
   the history may go on in a larger model: a symmetry switch.
-- A step may release the shell at its instability (`released_by`), to snap to rest.
+- A step may release the shell at its instability (`end.snap`), to snap to rest.
 - Pivots count unstable directions.
 """
 

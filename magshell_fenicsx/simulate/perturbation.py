@@ -24,9 +24,12 @@ from magshell_fenicsx.parts.revolution_sections import MaterialSection
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh
 
-# keys of a shell whose numbers change neither its mesh nor its perfect shape
-MATERIAL_KEYS = {*MaterialSection.model_fields, *LawKeys.model_fields, "laminate"}
-DIFFERENTIABLE_KEYS = {*MATERIAL_KEYS, "radius_to_thickness", "imperfections", "defect"}
+# keys of a shell whose numbers change neither its mesh nor its perfect shape, and imperfections
+DIFFERENTIABLE_KEYS = {
+    *MaterialSection.model_fields,
+    *LawKeys.model_fields,
+    *("laminate", "radius_to_thickness", "imperfections", "defect"),
+}
 KEYS_OUTSIDE_THE_MODEL = (
     "mesh",
     "stability",
@@ -159,7 +162,7 @@ def perturbed_scene(scenes: SceneCache, key: str, value: float) -> Scene:
     """
     assert scenes.base
     try:
-        return scenes.at((key, value), partial(scenes.base.problem.with_values, {key: value}))
+        return scenes.scene_at((key, value), partial(scenes.base.problem.with_values, {key: value}))
     except UnfitMesh as e:
         raise CaseError(f"{key}: {e}") from None
 

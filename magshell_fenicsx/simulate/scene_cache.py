@@ -99,8 +99,10 @@ class SceneCache:
         self._latest: Scene | None = None
         self._forms: SharedForms | None = None
 
-    def at(self, values: Hashable, make_problem: Callable[[], Problem]) -> Scene:
+    def scene_at(self, values: Hashable, make_problem: Callable[[], Problem]) -> Scene:
         """Return the scene at some values, which is made at the first call; collective.
+
+        A cache that overwrites its scene has no others.
 
         Parameters
         ----------
@@ -109,6 +111,7 @@ class SceneCache:
         make_problem
             Makes the problem at these values, for `scene_for`.
         """
+        assert not self._overwrites
         # taken out and put back, as the one that was used last
         scene = self._scenes.pop(values, None) or self.scene_for(make_problem())
         self._scenes[values] = scene
@@ -391,38 +394,40 @@ def _rims(problem: Problem) -> list[object]:
     ]
 
 
-def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
+def problem_on_mesh_of(scene: Scene, new_problem: Problem) -> Problem:
     """Return a problem on the mesh of a scene, whose nodes stay where they are in the chart.
 
     Their places in space follow from the new problem.
 
     Parameters
     ----------
-    new
+    new_problem
         Problem that differs from the scene's in numbers alone, also of imperfections.
     """
     old, model = scene.problem, scene.model
     meridian, shape = old.meridian, old.shape
     if model.midsurface:
-        shape = model.midsurface.with_embedding(new.embedding)
+        shape = model.midsurface.with_embedding(new_problem.embedding)
     elif model.axisymmetric:
-        assert new.meridian
-        meridian = replace(new.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0]))
+        assert new_problem.meridian
+        meridian = replace(
+            new_problem.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0])
+        )
     return replace(
         old,
-        context=new.context,
-        lambda_m=new.lambda_m,
-        body=new.body,
-        material=new.material,
-        loads=new.loads,
-        thickness=new.thickness,
-        embedding=new.embedding,
+        context=new_problem.context,
+        lambda_m=new_problem.lambda_m,
+        body=new_problem.body,
+        material=new_problem.material,
+        loads=new_problem.loads,
+        thickness=new_problem.thickness,
+        embedding=new_problem.embedding,
         meridian=meridian,
         shape=shape,
     )
 
 
-def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
+def problem_on_moved_mesh(scene: Scene, new_problem: Problem) -> Problem:
     """Return a problem on the mesh of a scene, which is stretched with the chart.
 
     A meridian's vertices move linearly between knots, the parameters at which cells must end. The
@@ -433,29 +438,29 @@ def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
     UnfitMesh
         If the mesh cannot follow the change of the chart.
     """
-    on_mesh, old = problem_on_mesh_of(scene, new), scene.problem
+    on_mesh, old = problem_on_mesh_of(scene, new_problem), scene.problem
     if on_mesh.meridian:
         assert old.meridian
-        assert new.meridian
+        assert new_problem.meridian
         # parameters at which cells must end, such as rims
-        knots, new_knots = old.meridian.knots, new.meridian.knots
+        knots, new_knots = old.meridian.knots, new_problem.meridian.knots
         if knots.shape != new_knots.shape:
             raise UnfitMesh("a rim of a dimple appears or vanishes on the way")
         vertices = on_mesh.meridian.vertices
         assert vertices is not None
         moved_vertices = np.interp(vertices, knots, new_knots)
         return replace(on_mesh, meridian=replace(on_mesh.meridian, vertices=moved_vertices))
-    bounds, new_bounds = _chart_bounds(old.shape), _chart_bounds(new.shape)
+    bounds, new_bounds = _chart_bounds(old.shape), _chart_bounds(new_problem.shape)
     if bounds is None or new_bounds is None:  # unknown: taken as the same
         return on_mesh
     if not scene.model.midsurface or np.allclose(bounds, new_bounds, 0, BOUNDS_TOLERANCE):
         return on_mesh
-    patch = scene.model.midsurface.with_embedding(new.embedding)
+    patch = scene.model.midsurface.with_embedding(new_problem.embedding)
     if patch.nodes.shape[1] != 2:  # nodes of a mesh file have three coordinates
         raise UnfitMesh("the mesh of this shape cannot move with the number")
     (low, high), (new_low, new_high) = bounds, new_bounds
     nodes = new_low + (patch.nodes - low) / (high - low) * (new_high - new_low)
-    return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
+    return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new_problem.points)
 
 
 def _chart_bounds(shape: object) -> tuple[Array, Array] | None:

@@ -204,6 +204,10 @@ class SceneFamily:
     ------
     CaseError
         If the number has no influence, or the instability cannot be followed.
+
+    Notes
+    -----
+    The scene belongs to the family from then on: its forms may hold the numbers of other scenes.
     """
 
     def __init__(

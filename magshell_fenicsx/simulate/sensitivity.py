@@ -307,12 +307,12 @@ def _by_imperfections_of_member_shells(stage: Stage, fold: Fold) -> dict[str, fl
     Each of these shells has its own section in the case.
     """
     members = stage.scene.problem.context.sections.get("shells") or {}
-    scenes = SceneCache(base=stage.scene)
-    return {key: _by_number(stage, fold, key, scenes) for key in _numbers_of_member_shells(members)}
+    return {key: _by_number(stage, fold, key) for key in _numbers_of_member_shells(members)}
 
 
-def _by_number(stage: Stage, fold: Fold, key: str, scenes: SceneCache) -> float:
+def _by_number(stage: Stage, fold: Fold, key: str) -> float:
     """Return the derivative by a number of the case, from scenes on the same mesh; collective."""
+    scenes = SceneCache(base=stage.scene)
     context = stage.scene.problem.context
     value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
     return _central_difference(

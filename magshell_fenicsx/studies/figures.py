@@ -121,19 +121,10 @@ def draw_points(
     file
         Name of the picture file.
     """
-    with point_figure(points, file) as plot:
-        draw_numbers(plot, axes, points, numbers)
-
-
-def draw_numbers(
-    plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], numbers: PointNumbers
-) -> None:
-    """Draw a number of each point into a panel: a map if the keys allow one, else lines."""
     axes = axes_of_points(axes, points)
-    if is_map(axes):
-        _draw_map(plot, axes, points, numbers)
-    else:
-        _draw_lines(plot, axes, points, numbers)
+    draw = _draw_map if is_map(axes) else _draw_lines
+    with point_figure(points, file) as plot:
+        draw(plot, axes, points, numbers)
 
 
 def is_map(axes: Sequence[Axis]) -> bool:

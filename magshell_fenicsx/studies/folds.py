@@ -310,7 +310,9 @@ def scene_of(case: Case, scenes: SceneCache) -> Scene:
     MeshError
         If the case cannot be meshed.
     """
-    scene = scenes.at(_apart_from_strength(case), lambda: with_modes(case.problem(), scenes.comm))
+    scene = scenes.scene_at(
+        _apart_from_strength(case), lambda: with_modes(case.problem(), scenes.comm)
+    )
     return with_field_strength(scene, case.context)
 
 

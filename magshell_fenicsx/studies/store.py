@@ -6,19 +6,17 @@ own as soon as it is there, so that an interrupted study goes on. Outcomes of ot
 program are not used.
 """
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-from uuid import uuid4
 
 from mpi4py import MPI
 from pydantic import TypeAdapter
 
-from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.durable import read_object, write_object
 from magshell_fenicsx.output.store.folder import (
     DiskError,
     access_disk,
@@ -49,7 +47,7 @@ class Folder:
         Keys of that object, by which a folder of such a study is recognised.
     points
         Subfolder of the outcomes.
-    first
+    first_table
         A table that is created empty at the start, so that an unwritable folder is refused at once.
     """
 
@@ -57,7 +55,7 @@ class Folder:
     tables: tuple[str, ...]
     keys: tuple[str, ...]
     points: str = "points"
-    first: str = ""
+    first_table: str = ""
 
     def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
         """Make the folder, and return its path; collective. Several jobs may prepare the same one.
@@ -79,8 +77,8 @@ class Folder:
             refuse_other_tables(folder, self.tables, self.keys, self.what, case)
             for directory in (folder, folder / self.points):
                 directory.mkdir(parents=True, exist_ok=True)
-            if self.first:
-                (folder / self.first).touch()
+            if self.first_table:
+                (folder / self.first_table).touch()
 
         return prepare_folder(out, comm, make)
 
@@ -95,18 +93,15 @@ class Folder:
 def keep(file: Path, content: Mapping[str, Any]) -> None:
     """Write an outcome as a JSON file.
 
-    A killed study leaves the complete file or none: it is written under another name, and renamed.
-    Two processes may write the same file.
+    A killed study leaves the complete file or none. Two processes may write the same file.
 
     Raises
     ------
     DiskError
         For instance if the disk is full; earlier files are kept.
     """
-    unfinished = file.with_suffix(f".{uuid4().hex}")
     try:
-        write_object(unfinished, content)
-        unfinished.replace(file)
+        write_object(file, content)
     except OSError as e:
         raise DiskError(f"{file} cannot be written: {e.strerror}") from e
 
@@ -126,7 +121,7 @@ def stored_outcome(
         Keys of the file with the values that they must have.
     """
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_object(file)
         if any(content[name] != value for name, value in same.items()):
             return None
         return kind.validate_python(content[key] if key else content)
@@ -198,7 +193,7 @@ class OutcomeStore(Generic[OutcomeType]):
         self,
         points: Iterable[PointType],
         comm: MPI.Comm,
-        serves: Callable[[OutcomeType], bool] = lambda outcome: True,
+        is_sufficient: Callable[[OutcomeType], bool] = lambda outcome: True,
     ) -> list[PointType]:
         """Return the points without an outcome that can be used, of equal ones the first.
 
@@ -206,14 +201,14 @@ class OutcomeStore(Generic[OutcomeType]):
 
         Parameters
         ----------
-        serves
+        is_sufficient
             Whether a stored outcome has what is wanted.
         """
 
         def is_missing(point: PointType) -> bool:
             """Return whether a point has to be computed; called on rank 0."""
             outcome = self.outcome(point.key)
-            return outcome is None or not serves(outcome)
+            return outcome is None or not is_sufficient(outcome)
 
         first_points = dict[str, PointType]()
         for point in points:

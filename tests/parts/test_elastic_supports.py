@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from continuation.toys import dense
+from continuation.toys import matrix
 from mpi4py import MPI
 
 from magshell_fenicsx.parts.supports.supports import unresisted
@@ -17,5 +17,5 @@ def test_a_soft_piece_is_held_by_its_own_stiffness(stiffer: float, held: bool) -
     K = np.kron(np.diag([1.0, stiffer]), row)
     K[0, 0] += 1e-6 * held
     motion = np.array([[1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0]])
-    free = unresisted(motion, lambda v: v, lambda: dense(K), MPI.COMM_SELF)
+    free = unresisted(motion, lambda v: v, lambda: matrix(K), MPI.COMM_SELF)
     assert len(free) == (not held)

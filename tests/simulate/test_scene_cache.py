@@ -98,7 +98,7 @@ def test_known_values_have_their_scene() -> None:
             made.append(ratio)
             return case.problem().with_values({"shell.poisson_ratio": ratio})
 
-        return cache.at(ratio, problem)
+        return cache.scene_at(ratio, problem)
 
     assert at(0.4) is at(0.4)
     assert at(0.3).problem.material.nu == 0.3

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from command import magshell, read_path, started
 from conftest import CAP, CASES
+from matplotlib.figure import Figure
 from scipy.optimize import brentq
 from scipy.special import jv, jvp
 
@@ -23,6 +24,18 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import problem_on_moved_mesh
 from magshell_fenicsx.studies.boundary.picture import _regions, draw_map
+
+
+def saved_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are saved from now on."""
+    figures, save = list[Figure](), Figure.savefig
+
+    def keep_and_save(figure: Figure, *arguments: Any, **keywords: Any) -> None:
+        figures.append(figure)
+        save(figure, *arguments, **keywords)
+
+    monkeypatch.setattr(Figure, "savefig", keep_and_save)
+    return figures
 
 
 def coarse() -> Path:
@@ -328,10 +341,7 @@ def test_a_load_is_in_the_units_of_the_case(
     """What is said and drawn is the column in Pa: 2 E/sqrt(3 (1 - nu^2)) (h/R)^2 times the load of
     the same row.
     """
-    import matplotlib.pyplot as plt
-
-    drawn: list[Any] = []
-    monkeypatch.setattr(plt, "close", drawn.append)
+    drawn = saved_figures(monkeypatch)
     case = tmp_path / "cap.yaml"
     case.write_text(CAP)
     said: list[str] = []
@@ -392,10 +402,7 @@ def test_a_map_is_named_as_in_a_paper(tmp_path: Path, monkeypatch: pytest.Monkey
     """Symbols for keys, signs of minus, words for loads; no second panel where all lines end by the
     same load.
     """
-    import matplotlib.pyplot as plt
-
-    drawn: list[Any] = []
-    monkeypatch.setattr(plt, "close", drawn.append)
+    drawn = saved_figures(monkeypatch)
     content = {
         "case": "a_map.yaml", "keys": ["shell.defect.amplitude", "magnetic.lambda_m"],
         "units": ["", ""], "range": [0.4, 2.0], "values": [-0.004, -0.002, 0.0], "load": "pressure",

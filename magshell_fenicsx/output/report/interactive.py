@@ -24,6 +24,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -315,6 +316,12 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps + share)])
 
 
+def _has_numbers(column: str, rows: Sequence[Row]) -> bool:
+    """Return whether a column has a number in each row, neither text nor nan as of a solid."""
+    values = (row[column] for row in rows)
+    return not any(isinstance(value, str) or isnan(value) for value in values)
+
+
 def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[str, Any]:
     """Return the path for the page: varying columns of path.csv, labels and curves.
 
@@ -341,7 +348,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[
         # the quantity of an axis is taken from its step, which says whose displacement it is
         quantities |= {q.name: q for q in axes_for(step)}
         axes += [q.name for q in axes_for(step)]
-    numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
+    numeric = [name for name in rows[0] if _has_numbers(name, rows)]
     columns = {}
     for name in dict.fromkeys([*axes, *varying_columns(rows, numeric)]):
         column_quantity = quantities.get(name) or quantity(name)

@@ -148,8 +148,8 @@ class Checkpoint:
     Parameters
     ----------
     file
-        The file of a run that begins (`empty_content`), or of an earlier run; an incomplete last
-        element is cut off.
+        The file of a run that begins (`run_identity.empty_checkpoint`), or of an earlier run; an
+        incomplete last element is cut off.
     V
         The displacement's space.
     comm

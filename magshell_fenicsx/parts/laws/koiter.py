@@ -19,5 +19,5 @@ class KoiterSection(LawSection):
         return Koiter(h, nu)
 
     @property
-    def in_solid(self) -> RubberSection:
+    def solid_law(self) -> RubberSection:
         return NeoHookeanSection.model_construct(law="neo-hookean")

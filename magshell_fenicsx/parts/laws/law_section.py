@@ -45,7 +45,7 @@ class LawSection(Section):
         """Return the law of a shell with the thickness h over R and Poisson's ratio nu."""
 
     @property
-    def in_solid(self) -> "RubberSection | None":
+    def solid_law(self) -> "RubberSection | None":
         """The law of a solid for which this one is chosen; None if there is no such solid."""
         return None
 
@@ -61,7 +61,7 @@ class RubberSection(LawSection):
         return Rubber(h, self.strain_energy())
 
     @property
-    def in_solid(self) -> "RubberSection":
+    def solid_law(self) -> "RubberSection":
         return self
 
 

@@ -24,7 +24,7 @@ class RubberMaterial(Ability):
 
     def refuse_unfit(self, context: Context) -> None:
         """Refuse a law that only shells have where the body is a solid, by a ValueError."""
-        if context.shell.law_section.in_solid is None:
+        if context.shell.law_section.solid_law is None:
             context.needs(f"law: {self.law}", "a mid-surface")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:

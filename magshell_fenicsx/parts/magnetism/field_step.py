@@ -87,7 +87,7 @@ class FieldSection(FactorStep):
             straight,
         )  # the solver takes long to import
 
-        def nothing(name: str) -> float:
+        def zero_conjugate(name: str) -> float:
             """Return the conjugate of the field, and its unit."""
             return 0.0
 
@@ -95,8 +95,8 @@ class FieldSection(FactorStep):
         along_direction = replace(
             step_start,
             mu={**step_start.mu, step_start.step.name: value},
-            potential=nothing,
-            unit=nothing,
+            potential=zero_conjugate,
+            unit=zero_conjugate,
             size=strength(step_start.context),
         )
         course = super().course(along_direction)

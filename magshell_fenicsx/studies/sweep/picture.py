@@ -18,7 +18,7 @@ from magshell_fenicsx.studies.figures import (
     STYLES,
     PointNumbers,
     axes_of_points,
-    draw_numbers,
+    draw_points,
     is_map,
     point_figure,
     point_label,
@@ -53,14 +53,14 @@ def draw_sweep(
         The name of a result and its value at each point; None draws energy barriers, knockdown
         factors or curves.
     """
-    axes, numbers = axes_of_points(axes, points), _numbers(outcomes, requested)
-    if is_map(axes):
+    numbers = _numbers(outcomes, requested)
+    if is_map(axes_of_points(axes, points)):
         numbers = numbers or _ends(outcomes)
+    if numbers:
+        draw_points(axes, points, numbers, file)
+        return
     with point_figure(points, file) as plot:
-        if numbers:
-            draw_numbers(plot, axes, points, numbers)
-        else:
-            _draw_curves(plot, points, outcomes)
+        _draw_curves(plot, points, outcomes)
 
 
 def _numbers(

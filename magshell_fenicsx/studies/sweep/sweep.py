@@ -45,7 +45,9 @@ from magshell_fenicsx.studies.sweep.chains import Chain, SweepCache, make_chains
 from magshell_fenicsx.studies.sweep.picture import draw_sweep
 
 NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
-FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
+FOLDER = Folder(
+    "a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first_table=TABLE
+)
 # columns of sweep.csv that are of the limit point; its first ones, after the keys; of curves.csv
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 FIRST_COLUMNS = (
