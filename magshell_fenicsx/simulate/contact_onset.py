@@ -71,11 +71,11 @@ def first_contact(
             continue
         # it is open: where does it close?
         if isinstance(contact, SurfaceContact):
-            way = _way_of_surfaces(contact, begin_displacement, end_displacement)
+            gap_along_step = _gap_between_surfaces(contact, begin_displacement, end_displacement)
         else:
             places = at_begin.evaluate(contact.places), at_end.evaluate(contact.places)
-            way = _way_beside_body(contact, *places, CROSSING_DISTANCE * h)
-        onset = _onset(way, CONTACT_DEPTH * h) if way else (1.0, False)
+            gap_along_step = _gap_beside_body(contact, *places, CROSSING_DISTANCE * h)
+        onset = _onset(gap_along_step, CONTACT_DEPTH * h) if gap_along_step else (1.0, False)
         # the earliest; of equal ones that behind a contact
         first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
     part, is_behind = first_event
@@ -83,8 +83,8 @@ def first_contact(
 
 
 @dataclass(frozen=True)
-class _Way:
-    """The straight way of a step, for one contact; lengths are over R.
+class _GapAlongStep:
+    """The gap of one contact on the straight way of a step; lengths are over R.
 
     Attributes
     ----------
@@ -101,8 +101,8 @@ class _Way:
     crossing_distance: float
 
 
-def _way_of_surfaces(contact: SurfaceContact, u: Array, v: Array) -> _Way | None:
-    """Return the way between two displacements (nodes, 3) of all ranks; None if shells stay apart.
+def _gap_between_surfaces(contact: SurfaceContact, u: Array, v: Array) -> _GapAlongStep | None:
+    """Return the gap between two displacements (nodes, 3) of all ranks; None if shells stay apart.
 
     Collective.
     """
@@ -115,13 +115,13 @@ def _way_of_surfaces(contact: SurfaceContact, u: Array, v: Array) -> _Way | None
         """Return the least gap after a part of the way."""
         return contact.gap(u + part * (v - u))
 
-    return _Way(gap, largest_approach, CROSSING_DISTANCE * contact.least_thickness())
+    return _GapAlongStep(gap, largest_approach, CROSSING_DISTANCE * contact.least_thickness())
 
 
-def _way_beside_body(
+def _gap_beside_body(
     contact: BodyContact, x: Array, y: Array, crossing_distance: float
-) -> _Way | None:
-    """Return the way between places (points, 3) relative to a body; None if nothing moves.
+) -> _GapAlongStep | None:
+    """Return the gap between places (points, 3) relative to a body; None if nothing moves.
 
     The places are those of quadrature points of this rank. Collective.
     """
@@ -133,7 +133,7 @@ def _way_beside_body(
         """Return the least gap after a part of the way."""
         return contact.least_gap(x + part * (y - x))
 
-    return _Way(gap, largest_approach, crossing_distance) if largest_approach else None
+    return _GapAlongStep(gap, largest_approach, crossing_distance) if largest_approach else None
 
 
 def gathered_displacement(scene: Scene, state: State) -> Array:
@@ -145,7 +145,7 @@ def gathered_displacement(scene: Scene, state: State) -> Array:
     return np.asarray(np.concatenate(displacements_of_ranks).reshape(-1, 3))
 
 
-def _onset(way: _Way, depth: float) -> tuple[float, bool]:
+def _onset(gap_along_step: _GapAlongStep, depth: float) -> tuple[float, bool]:
     """Return where a step on a way ends for a contact that is open; collective.
 
     The gap is evaluated on the way, first in steps so short that no face passes through another
@@ -161,7 +161,7 @@ def _onset(way: _Way, depth: float) -> tuple[float, bool]:
     part, is_behind
         The part of the way, 1 without a contact; and whether the step ends behind the contact.
     """
-    gap_at_low = way.gap(0.0)
+    gap_at_low = gap_along_step.gap(0.0)
     if gap_at_low <= 0:
         return 1.0, False
     # from near the contact the step ends behind it, at the gap -depth, else before it, at +depth
@@ -173,8 +173,12 @@ def _onset(way: _Way, depth: float) -> tuple[float, bool]:
         if high:  # linear interpolation of the gap
             part = low + (high - low) * (gap_at_low - aimed_gap) / (gap_at_low - gap_at_high)
         else:  # so far no face can pass through another one
-            part = min(1.0, low + (gap_at_low + way.crossing_distance) / way.largest_approach)
-        gap = way.gap(part)
+            part = min(
+                1.0,
+                low
+                + (gap_at_low + gap_along_step.crossing_distance) / gap_along_step.largest_approach,
+            )
+        gap = gap_along_step.gap(part)
         if gap < aimed_gap - depth:  # too far
             high, gap_at_high = part, gap
         elif gap <= aimed_gap + depth:  # exact enough
