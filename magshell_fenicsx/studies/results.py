@@ -15,13 +15,13 @@ from typing import Any
 
 from scipy.interpolate import barycentric_interpolate
 
+import magshell_fenicsx.parts.registered  # noqa: F401  the columns of parts are in the registry
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
-from magshell_fenicsx.quantities.registry import IN_TIME, OWN_MODES, quantity
+from magshell_fenicsx.quantities.registry import OWN_MODES, QUANTITIES, quantity
 
-# columns with numbers: without units, and with those in units
-BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
-NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))
+# columns of single things: a named point or support, a second load, and the displacement at a load
+OF_ONE = re.compile(r"\w+_[ufm][xyz](_[A-Za-z]+)?|(force|load)_\d+|w_(force|load)(_\d+)?_over_h")
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
 FORMS = (
@@ -109,7 +109,7 @@ def parse_scalar(text: str) -> Scalar:
         )
     # both names must be columns with numbers; "end" has no second one
     for name in (column, place_column) if place != "end" else (column,):
-        if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
+        if not _may_have_numbers(name):
             raise CaseError(
                 f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}"
             )
@@ -122,6 +122,19 @@ def parse_scalar(text: str) -> Scalar:
     if not math.isfinite(value):
         raise CaseError(f"--result {text}: {number or 'nothing'} is no finite number; {FORMS}")
     return Scalar(text, column, place_column, value)
+
+
+def _may_have_numbers(column: str) -> bool:
+    """Return whether a path.csv may have a column with numbers of this name, in a unit or without.
+
+    It is a column of every run, of a part, or of one thing of several, such as a body.
+    """
+    if column in TEXTS or OF_ONE.fullmatch(column):
+        return column not in TEXTS
+    registered = [quantity(name) for name in (*COLUMNS, *QUANTITIES) if name not in TEXTS]
+    names = {name for q in registered for name in (q.name, *(unit.name for unit in q.in_units))}
+    is_of_family = any(q.each and column.startswith(f"{q.name}_") for q in registered)
+    return column in names or is_of_family
 
 
 def _crossing(

@@ -104,6 +104,13 @@ def test_results_of_the_summary() -> None:
 
 
 @pytest.mark.parametrize(
+    "column", ["w_mm", "gravity_m_per_s2", "force_ball", "force_2", "A_uz_mm", "rim_fz", "time"]
+)
+def test_columns_of_all_parts_are_results(column: str) -> None:
+    assert parse_scalar(f"{column}@end") == Scalar(f"{column}@end", column, "end")
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         (
