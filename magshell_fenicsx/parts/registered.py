@@ -39,5 +39,5 @@ def step_class_of(name: str) -> type[Step]:
 
 def abilities_of(context: Context) -> list[Ability]:
     """Return all abilities that a problem has, in the order in which they are registered."""
-    found = (ability.from_context(context) for ability in ABILITY_CLASSES)
-    return [ability for ability in found if ability is not None]
+    abilities = (ability_class.from_context(context) for ability_class in ABILITY_CLASSES)
+    return [ability for ability in abilities if ability is not None]

@@ -101,7 +101,7 @@ class Step(Part):
 
     @property
     def end(self) -> StepEnd:
-        """Where the step ends, and what follows there."""
+        """The event and the target at which the step ends, and what follows there."""
         return StepEnd()
 
     @property

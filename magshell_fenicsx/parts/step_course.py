@@ -133,7 +133,7 @@ class Target(NamedTuple):
 
 @dataclass(frozen=True)
 class StepEnd:
-    """Where a step ends, and what follows there.
+    """The end of a step: its event and target, and what follows there.
 
     Attributes
     ----------

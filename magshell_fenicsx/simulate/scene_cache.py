@@ -241,7 +241,7 @@ class SharedForms:
 
     @property
     def value(self) -> float:
-        """Which scene's numbers are in place."""
+        """The value of the scene whose numbers are in place."""
         return self._value
 
     @value.setter

@@ -21,7 +21,9 @@ from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.quantities.registry import OWN_MODES, QUANTITIES, quantity
 
 # columns of single things: a named point or support, a second load, and the displacement at a load
-OF_ONE = re.compile(r"\w+_[ufm][xyz](_[A-Za-z]+)?|(force|load)_\d+|w_(force|load)(_\d+)?_over_h")
+SINGLE_COLUMNS = re.compile(
+    r"\w+_[ufm][xyz](_[A-Za-z]+)?|(force|load)_\d+|w_(force|load)(_\d+)?_over_h"
+)
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
 FORMS = (
@@ -129,8 +131,10 @@ def _may_have_numbers(column: str) -> bool:
 
     It is a column of every run, of a part, or of one thing of several, such as a body.
     """
-    if column in TEXTS or OF_ONE.fullmatch(column):
-        return column not in TEXTS
+    if column in TEXTS:
+        return False
+    if SINGLE_COLUMNS.fullmatch(column):
+        return True
     registered = [quantity(name) for name in (*COLUMNS, *QUANTITIES) if name not in TEXTS]
     names = {name for q in registered for name in (q.name, *(unit.name for unit in q.in_units))}
     is_of_family = any(q.each and column.startswith(f"{q.name}_") for q in registered)
