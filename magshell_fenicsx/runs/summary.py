@@ -309,7 +309,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     """
     scene = result.scene
     # the problem as the case has it, before its mesh was adapted
-    requested_problem = result.adapted.asked if result.adapted else scene.problem
+    requested_problem = result.adapted.requested if result.adapted else scene.problem
     model, newton = scene.model, scene.newton
     # entries that only some runs have: of the first snap, and of mesh.tolerance
     snaps_of_run = snaps(result.rows)

@@ -93,7 +93,7 @@ def compute(
         )
 
     # `progress` says lines, and after a long silence that the work goes on
-    with _wait_for_all(comm), heard(comm, say, remaining_text) as progress:
+    with _wait_for_all(comm), reporting_progress(comm, say, remaining_text) as progress:
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
                 done_count = i + 1  # on all ranks together, since tasks are dealt in order
@@ -137,7 +137,7 @@ def compute_points(
     compute(points, point_computed, comm, say)
 
 
-class Heard:
+class ProgressReporter:
     """Passes lines on; after a long silence it says that the work goes on.
 
     Reminders are written by `remind`, which runs in a thread of its own.
@@ -184,15 +184,17 @@ class Heard:
 
 
 @contextmanager
-def heard(comm: MPI.Comm, say: Say, remaining_text: Callable[[], str] = str) -> Iterator[Say]:
-    """Yield a `Heard`, which reminds on rank 0 alone while the `with` block runs.
+def reporting_progress(
+    comm: MPI.Comm, say: Say, remaining_text: Callable[[], str] = str
+) -> Iterator[Say]:
+    """Yield a `ProgressReporter`, which reminds on rank 0 alone while the `with` block runs.
 
-    On other ranks, and if `say` is a `Heard` already, `say` itself is yielded.
+    On other ranks, and if `say` is a `ProgressReporter` already, `say` itself is yielded.
     """
-    if isinstance(say, Heard) or comm.rank:
+    if isinstance(say, ProgressReporter) or comm.rank:
         yield say
         return
-    progress = Heard(say, remaining_text)
+    progress = ProgressReporter(say, remaining_text)
     thread = threading.Thread(target=progress.remind, daemon=True)
     thread.start()
     try:

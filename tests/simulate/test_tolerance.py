@@ -230,7 +230,7 @@ def test_equal_shares() -> None:
 @pytest.mark.slow
 def test_the_mesh_is_kept_for_a_run_that_is_resumed(half_mesh: Adapted) -> None:
     case, mesh = buckling(1e-2), half_mesh
-    again = Adapted.from_json(mesh.asked, mesh.to_json())
+    again = Adapted.from_json(mesh.requested, mesh.to_json())
     assert replace(again, choice=mesh.choice) == mesh
     for x in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
         assert again.choice.applied(case.problem()).size(x) == mesh.choice.applied(

@@ -201,7 +201,7 @@ def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
         time.sleep(0.5)
         yield f"{number} done"
 
-    with runner.heard(MPI.COMM_SELF, said.append) as told:
+    with runner.reporting_progress(MPI.COMM_SELF, said.append) as told:
         compute([1, 2], slow, MPI.COMM_SELF, told)
     reminders = [line for line in said if line.startswith("still computing, 0:0")]
     assert 2 <= len(reminders) <= 4
@@ -215,7 +215,7 @@ def test_long_silence_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_reminders_have_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "SECONDS_BETWEEN_LINES", 0.1)
     said: list[str] = []
-    with runner.heard(MPI.COMM_SELF, said.append, lambda: ", about 2 h left"):
+    with runner.reporting_progress(MPI.COMM_SELF, said.append, lambda: ", about 2 h left"):
         time.sleep(0.35)
     assert said
     assert all(re.fullmatch(r"still computing, 0:00 so far, about 2 h left", line) for line in said)

@@ -203,7 +203,7 @@ def project_formula(
     integrals = _moments(
         rule, projected_cells, scale, first_parts, threshold, space, nodal.shape[-1]
     )
-    polynomials = _CellPolynomials.with_moments(space, degree, integrals.moments)
+    polynomials = _ProjectedPolynomials.with_moments(space, degree, integrals.moments)
     at_nodes = polynomials.at(element.points)
     if bounded:
         at_nodes = polynomials.bounded(at_nodes, samples.X, samples.f[projected_cells])
@@ -228,7 +228,7 @@ def _with_errors(
     samples: "_CellSamples",
     projected_cells: Numbers,
     integrals: "_Moments",
-    polynomials: "_CellPolynomials",
+    polynomials: "_ProjectedPolynomials",
     total_square: float,
 ) -> ProjectedFormula:
     """Return a projected formula with its size and with the errors that are left; collective.
@@ -345,7 +345,7 @@ def _sample_cells(
 
 
 @dataclass(frozen=True)
-class _CellPolynomials:
+class _ProjectedPolynomials:
     """Polynomials p on some cells.
 
     Attributes
@@ -364,7 +364,7 @@ class _CellPolynomials:
     at_points: Array
 
     @classmethod
-    def with_moments(cls, space: Element, degree: int, moments: Array) -> "_CellPolynomials":
+    def with_moments(cls, space: Element, degree: int, moments: Array) -> "_ProjectedPolynomials":
         """Return the polynomials of a degree with moments (cells, functions, components)."""
         Y, v = basix.make_quadrature(space.cell_type, 2 * degree)
         phi = space.tabulate(0, Y)[0, :, :, 0]

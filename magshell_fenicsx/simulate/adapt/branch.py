@@ -107,10 +107,10 @@ def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | 
         If the branch has no result on any mesh.
     """
     failure = NoResult("no mesh is fine enough")
-    if first.asked.body:
+    if first.requested.body:
         raise NoResult("of a solid nothing is carried between meshes")
     for refinement in FIRST_REFINEMENTS:
-        scene, choice = first.choice.scene(first.asked, comm), Choice(PATH_DEGREE, refinement)
+        scene, choice = first.choice.scene(first.requested, comm), Choice(PATH_DEGREE, refinement)
         scene.remesh = choice.applied  # the mesh of the larger model alone
         last_record: Record | None = None
         try:

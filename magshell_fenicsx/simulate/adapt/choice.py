@@ -167,7 +167,7 @@ class Adapted:
 
     Attributes
     ----------
-    asked
+    requested
         The problem with the tolerance.
     choice, best
         The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least
@@ -179,7 +179,7 @@ class Adapted:
         not, or no mesh is found.
     """
 
-    asked: Problem
+    requested: Problem
     choice: Choice
     best: AdaptiveRound
     rounds: list[AdaptiveRound]
@@ -204,7 +204,7 @@ class Adapted:
         result_tolerance = max(chosen.estimate, LOAD_TOLERANCE) * abs(chosen.result)
         is_same = result is not None and abs(result - chosen.result) <= result_tolerance
         return {
-            "tolerance": self.asked.mesh.tolerance,
+            "tolerance": self.requested.mesh.tolerance,
             "error_estimate": chosen.estimate if is_same else None,
             "best": {"result": most_exact.result, "error_estimate": most_exact.estimate}
             if is_same

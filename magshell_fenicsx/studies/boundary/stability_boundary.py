@@ -15,18 +15,13 @@ goes on.
 mode, amplitude, step, its value, and the state (u as text, mu).
 """
 
-import copy
-import hashlib
-import json
-import re
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.augmented import BoundaryPoint, NoSystem
@@ -34,38 +29,33 @@ from magshell_fenicsx.continuation.boundary import Boundary, BoundaryLost, Label
 from magshell_fenicsx.continuation.critical import critical_boundary, first_mode
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.section import in_unit, number_and_unit
-from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.input.source import CaseError, override, read_source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
-from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow_alone
-from magshell_fenicsx.simulate.perfect import with_modes
-from magshell_fenicsx.simulate.perturbation import KEYS_OUTSIDE_THE_MODEL
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_family import WAVES, SceneFamily, first_instability
 from magshell_fenicsx.studies.boundary.journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary.picture import draw_boundary
 from magshell_fenicsx.studies.boundary.start import Start, start_from
+from magshell_fenicsx.studies.boundary.varied_case import Range, VariedCase, parse_range
 from magshell_fenicsx.studies.naming import load_text
-from magshell_fenicsx.studies.points import MakeCase, value_at
-from magshell_fenicsx.studies.runner import Say, compute, heard, remaining_time_text
+from magshell_fenicsx.studies.points import MakeCase
+from magshell_fenicsx.studies.runner import Say, compute, remaining_time_text, reporting_progress
 from magshell_fenicsx.studies.store import Folder, write_table
 
-FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
 FOLDER = Folder(
     "a boundary",
     ("boundary.json", "boundary.csv", "boundary.png"),
     ("case", "key", "load", "special"),
 )
 COLUMNS = ("key", "load", "kind", "mode", "error", "unstable", "factorisations")
-STEPS, MOST_STEPS = 20, 1000
 END_TOLERANCE = 1e-6  # of the range: so close to its end a boundary is there
 SPECIAL = ("cusp", "turn", "meeting", "crossing")
 WORDS_OF_KINDS = {
@@ -75,75 +65,6 @@ WORDS_OF_KINDS = {
     "crossing": "two bifurcations cross",
 }
 CHANGED = "a fold and a bifurcation change their order"
-
-
-@dataclass(frozen=True)
-class Range:
-    """The key of a case that varies, and its range.
-
-    Attributes
-    ----------
-    first, last
-        First and last value in `unit`, in either order.
-    unit
-        Unit of the values; "" without.
-    steps
-        Least number of steps between both.
-    """
-
-    key: str
-    first: float
-    last: float
-    unit: str
-    steps: int
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """The least and the largest value, in rising order."""
-        return min(self.first, self.last), max(self.first, self.last)
-
-    def text(self, value: float) -> str:
-        """Return a value in the unit as in the case file."""
-        return f"{float(value)!r} {self.unit}".rstrip()
-
-
-def parse_range(text: str) -> Range:
-    """Read `--over`, the key of a boundary and its range.
-
-    Raises
-    ------
-    CaseError
-        If the text has another form, or is no range.
-
-    Examples
-    --------
-    >>> parse_range("magnetic.applied.flux_density=-40mT:0.04T")
-    Range(key='magnetic.applied.flux_density', first=-40.0, last=40.0, unit='mT', steps=20)
-    >>> parse_range("foundation.stiffness=0:1e-3:40").steps
-    40
-    """
-    key, _, values = text.partition("=")
-    bounds_and_steps = values.split(":")
-    # the values are first:last or first:last:steps
-    try:
-        if not re.fullmatch(r"\w+(\.\w+)*", key) or len(bounds_and_steps) not in (2, 3):
-            raise ValueError
-        # the unit of the first bound that has one counts for both
-        unit = number_and_unit(bounds_and_steps[0])[1] or number_and_unit(bounds_and_steps[1])[1]
-        first, last = (in_unit(bound, unit) for bound in bounds_and_steps[:2])
-        steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else STEPS
-    except ValueError:
-        raise CaseError(f"--over {text}: {FORMS}") from None
-    if not np.isfinite([first, last]).all() or first == last:
-        raise CaseError(f"--over {text}: first and last must be two different finite numbers")
-    if not 1 <= steps <= MOST_STEPS:
-        raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
-    if key.split(".")[0] in KEYS_OUTSIDE_THE_MODEL:
-        raise CaseError(
-            f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has "
-            "no boundary"
-        )
-    return Range(key, first, last, unit, steps)
 
 
 @dataclass(frozen=True)
@@ -218,34 +139,16 @@ def boundary(
     # the case of another run takes the place of the file, and so of its settings
     for setting in settings if start else ():
         override(source, setting)
-    folder, name = user_folder(out), Path(file).name
+    varied, folder, name = VariedCase(source, span, make_case), user_folder(out), Path(file).name
     say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
-    with FOLDER.locked(folder, comm, name), heard(comm, say_on_first_rank) as say_on_first_rank:
+    with (
+        FOLDER.locked(folder, comm, name),
+        reporting_progress(comm, say_on_first_rank) as say_on_first_rank,
+    ):
         say = say_on_first_rank if comm.rank == 0 else say
-        journal = partial(
-            Journal, folder / "points", _identity(source, span, make_case, begun_at.text)
-        )
-        value = _value(source, span, make_case, may_be_outside=not start)
-        # the instability at the start, as plain data
-        begin = access_disk(
-            comm, lambda: _begin(source, span, value, make_case, journal("start"), say, begun_at)
-        )
-        name_of_mode = begin["mode"]
-        # a half cannot follow a mode that it excludes; to the whole shell the mode is its own
-        if name_of_mode == "antisymmetric":
-            say_on_first_rank("the instability is antisymmetric: the whole shell is modelled")
-            override(source, "symmetry=none")
-            # the points of the whole shell's history have other numbers
-            whole_start = begun_at.anywhere()
-            begin = access_disk(
-                comm,
-                lambda: _begin(source, span, value, make_case, journal("whole"), say, whole_start),
-            )
-        if not begin["label"]:
-            first_instability([])  # raises the error that there is none
-        # the name is that of the first run, unless the whole shell has found a fold
-        name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
-        begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
+        journal = partial(Journal, folder / "points", varied.identity(begun_at.text))
+        value = varied.start_value(may_be_outside=not start)
+        begin = _begin(varied, value, begun_at, journal, comm, say_on_first_rank)
         say_on_first_rank(
             f"{span.key} = {span.text(value)}: {begin['label']} at "
             f"{load_text(begin['row'], begin['amplitude'])}"
@@ -261,9 +164,7 @@ def boundary(
             """
             part_journal = journal("down" if sense < 0 else "up")
             if not part_journal.outcome:
-                part_journal.finish(
-                    _followed(source, span, value, sense, make_case, begin, part_journal, say)
-                )
+                part_journal.finish(_followed(varied, value, sense, begin, part_journal, say))
             rows = part_journal.outcome["rows"]
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
@@ -279,74 +180,64 @@ def boundary(
     return stability_boundary
 
 
-def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: bool) -> float:
-    """Return the value of the key, in the unit of the range, at which the boundary starts.
+def _begin(
+    varied: VariedCase,
+    value: float,
+    start: Start,
+    journal: Callable[[str], Journal],
+    comm: MPI.Intracomm,
+    say: Say,
+) -> dict[str, Any]:
+    """Return the instability at which the boundary starts, as plain data; collective.
 
-    It is the value of the case; outside the range the nearest end. If the case has no number in
-    this unit there, such as a word, it is the first value of the range.
+    A half cannot follow a mode that it excludes. The whole shell, of which such a mode is its own,
+    then takes its place in `varied`.
 
     Parameters
     ----------
-    may_be_outside
-        Whether the value of the case may be outside the range.
+    value
+        Value of the key at which the case is run, in the unit of the range.
+    start
+        Says which instability of the history is taken.
+    journal
+        Called with the name of a part; it returns the journal of this part.
+    say
+        Called with remarks of the run, on rank 0.
+
+    Returns
+    -------
+    `begin` as the module describes it, with two more keys: `name_of_mode`, as reported, and
+    `is_first`, whether it is meant to be the first instability of the case.
 
     Raises
     ------
-    CaseError
-        If the key is a section, a list or a truth value, or its value is outside.
+    CaseError, Stopped
+        As `_run_to_instability`; and if there is no instability.
     """
-    key_path = span.key.split(".")
-    value_in_case = value_at(source.data, key_path)
-    if value_in_case is None:  # the case file does not have the key: its default counts
-        value_in_case = value_at(make_case(source).model_dump(mode="json"), key_path)
-    try:
-        value = in_unit(str(value_in_case), span.unit)
-    except ValueError:  # no number in this unit
-        if isinstance(value_in_case, dict | list | bool):
-            raise CaseError(
-                f"--over {span.key}: is no number in the case, but {type(value_in_case).__name__}"
-            ) from None
-        value = span.first
-    if not may_be_outside and not span.ends[0] <= value <= span.ends[1]:
-        raise CaseError(
-            f"--over {span.key}: the run that it starts from has {span.text(value)}, outside the "
-            "range"
+
+    def instability(part: str, start: Start) -> dict[str, Any]:
+        """Return the instability in a history, of which the part keeps the journal."""
+        return access_disk(
+            comm, lambda: _run_to_instability(varied, value, journal(part), say, start)
         )
-    return float(np.clip(value, *span.ends))
+
+    begin = instability("start", start)
+    name_of_mode = begin["mode"]
+    if name_of_mode == "antisymmetric":
+        say("the instability is antisymmetric: the whole shell is modelled")
+        override(varied.source, "symmetry=none")
+        # the points of the whole shell's history have other numbers
+        begin = instability("whole", start.anywhere())
+    if not begin["label"]:
+        first_instability([])  # raises the error that there is none
+    # the name is that of the first run, unless the whole shell has found a fold
+    name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
+    return {**begin, "name_of_mode": name_of_mode, "is_first": not start.text}
 
 
-def _problem(source: Source, span: Range, make_case: MakeCase, value: float) -> Problem:
-    """Return the problem of the case at a value of the key, in the unit of the range.
-
-    It has the modes of the perfect shell that its imperfections need.
-
-    Raises
-    ------
-    CaseError
-        If the problem is not valid.
-    """
-    source_at_value, assignment = copy.deepcopy(source), f"{span.key}={span.text(value)}"
-    try:
-        override(source_at_value, assignment)
-        problem: Problem = make_case(source_at_value).problem()
-        refuse_beyond_memory(problem)
-    except CaseError as e:
-        raise CaseError(str(e).replace(f"--set {assignment}", f"--over {assignment}")) from None
-    return with_modes(problem, MPI.COMM_SELF) if problem.pending_modes else problem
-
-
-def _identity(source: Source, span: Range, make_case: MakeCase, start: str) -> str:
-    """Return a hash of the case, the range and the text of the start, for names of journals."""
-    case = make_case(source)
-    data = [case.model_dump(mode="json") | case.outside, asdict(span), *([start] if start else [])]
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _begin(
-    source: Source,
-    span: Range,
+def _run_to_instability(
+    varied: VariedCase,
     value: float,
-    make_case: MakeCase,
     journal: Journal,
     say: Say,
     start: Start,
@@ -355,8 +246,8 @@ def _begin(
 
     Parameters
     ----------
-    span, value
-        Range of the key, and the value in its unit at which the case is run.
+    value
+        Value of the key at which the case is run, in the unit of the range.
     journal
         Keeps the outcome of the run.
     say
@@ -376,11 +267,11 @@ def _begin(
     Stopped
         If the path is lost before the instability.
     """
-    for end in span.ends:  # raises errors before anything is computed
-        _problem(source, span, make_case, end)
+    for end in varied.span.ends:  # raises errors before anything is computed
+        varied.problem(end)
     if journal.outcome:
         return journal.outcome
-    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
+    scene = Scene(varied.problem(value), MPI.COMM_SELF)
     records, lost_reason = _records_to_start(scene, start, say)
     try:
         instability = start.instability_in(records)
@@ -430,11 +321,9 @@ def _records_to_start(scene: Scene, start: Start, say: Say) -> tuple[list[Record
 
 
 def _followed(
-    source: Source,
-    span: Range,
+    varied: VariedCase,
     value: float,
     sense: int,
-    make_case: MakeCase,
     begin: dict[str, Any],
     part_journal: Journal,
     say: Say,
@@ -448,8 +337,7 @@ def _followed(
     sense
         Direction of the key: -1 falling, 1 growing.
     begin
-        The instability at the start, with two more keys: `name_of_mode`, as reported, and
-        `is_first`, whether it is meant to be the first instability of the case.
+        The instability at the start, as `_begin` returns it.
     part_journal
         Journal that replays the solves of an interrupted boundary.
 
@@ -465,7 +353,7 @@ def _followed(
     Stopped
         If not even the start is found.
     """
-    family = _scene_family(source, span, value, make_case, begin)
+    span, family = varied.span, _scene_family(varied, value, begin)
     # changes of load and key that count as of order one in the arc length of the boundary
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     rows: list[dict[str, Any]] = []
@@ -512,9 +400,7 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": family.has_one_scene}
 
 
-def _scene_family(
-    source: Source, span: Range, value: float, make_case: MakeCase, begin: dict[str, Any]
-) -> SceneFamily:
+def _scene_family(varied: VariedCase, value: float, begin: dict[str, Any]) -> SceneFamily:
     """Return the scenes of the case for all values of the key, about the instability at the start.
 
     Parameters
@@ -529,16 +415,15 @@ def _scene_family(
     CaseError
         If the key has no influence, or the instability cannot be followed.
     """
-    scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
+    span, scene = varied.span, Scene(varied.problem(value), MPI.COMM_SELF)
     u = vector_of(begin["u"])
     # only the state of the point is known, and needed
     point = Point(
         State(u, begin["mu"]), s=0.0, du=0.0 * u, dmu=0.0, negative_pivots=0, negative_pivots_held=0
     )
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
-    make_problem = partial(_problem, source, span, make_case)
     try:
-        return SceneFamily(scene, record, make_problem, value, value_range=span.ends)
+        return SceneFamily(scene, record, varied.problem, value, value_range=span.ends)
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
 

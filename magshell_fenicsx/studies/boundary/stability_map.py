@@ -22,8 +22,8 @@ from magshell_fenicsx.studies.boundary.stability_boundary import (
     COLUMNS,
     StabilityBoundary,
     boundary,
-    parse_range,
 )
+from magshell_fenicsx.studies.boundary.varied_case import parse_range
 from magshell_fenicsx.studies.points import Axis, MakeCase, parse_axis
 from magshell_fenicsx.studies.runner import Say
 from magshell_fenicsx.studies.store import Folder, write_table

@@ -61,18 +61,18 @@ class NothingLeft(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Used:
+class Usage:
     """The content of usage.json of a run.
 
     Attributes
     ----------
-    asked
+    request
         The request: text and settings of the case, and the sources.
     cpu_s, wall_s
         Times of the process.
     """
 
-    asked: dict[str, Any]
+    request: dict[str, Any]
     cpu_s: float
     wall_s: float
 
@@ -118,7 +118,7 @@ def run_model(
         "settings": model_settings,
         "sources": code_version(),
     }
-    usage = stored_outcome(folder / "usage.json", TypeAdapter(Used))
+    usage = stored_outcome(folder / "usage.json", TypeAdapter(Usage))
     results, reason = _stored_results(folder, usage, request)
     if reason:
         say(f"{model} at refinement {refinement:g}: computed again, {reason}")
@@ -138,7 +138,7 @@ Results = tuple[dict[str, Any], list[dict[str, str]]]
 
 
 def _stored_results(
-    folder: Path, usage: Used | None, request: Mapping[str, Any]
+    folder: Path, usage: Usage | None, request: Mapping[str, Any]
 ) -> tuple[Results | None, str]:
     """Return the results of the run in a folder, and why they do not serve.
 
@@ -156,13 +156,13 @@ def _stored_results(
     reason
         Why the run of this case is computed again; "" if it serves, or if there is none.
     """
-    if usage and usage.asked == request:
+    if usage and usage.request == request:
         try:
             return (read_summary(folder), read_lines(folder / "path.csv")), ""
         except (OSError, Damaged) as e:
             return None, str(e)
     # the same but for the sources
-    if usage and usage.asked | {"sources": request["sources"]} == request:
+    if usage and usage.request | {"sources": request["sources"]} == request:
         return None, "the folder has results of other sources of magshell_fenicsx"
     return None, ""
 
@@ -184,7 +184,7 @@ def _refuse_another_case(folder: Path, case: Path) -> None:
 
 def _run_in_process(
     case: Path, model: ModelName, folder: Path, request: Mapping[str, Any]
-) -> tuple[Used, Results]:
+) -> tuple[Usage, Results]:
     """Run a case in a process of its own into a folder, and write its usage.json.
 
     Parameters
@@ -213,7 +213,7 @@ def _run_in_process(
         raise NothingLeft(f"model: {model}: {measured.last_error or f'exit code {measured.code}'}")
     summary, rows = read_summary(folder), read_lines(folder / "path.csv")
     # the sources that the run has recorded itself
-    usage = Used({**request, "sources": summary["sources"]}, measured.cpu_s, measured.wall_s)
+    usage = Usage({**request, "sources": summary["sources"]}, measured.cpu_s, measured.wall_s)
     keep(folder / "usage.json", asdict(usage))
     return usage, (summary, rows)
 

@@ -43,7 +43,7 @@ from magshell_fenicsx.studies.design.goal import DesignGoal, design_goal_of, sea
 from magshell_fenicsx.studies.design.picture import ReachedShape, draw_design, reached_shape
 from magshell_fenicsx.studies.design.variables import Variables, variables
 from magshell_fenicsx.studies.points import Case, MakeCase, identity
-from magshell_fenicsx.studies.runner import Say, heard, remaining_time_text
+from magshell_fenicsx.studies.runner import Say, remaining_time_text, reporting_progress
 from magshell_fenicsx.studies.store import Folder, OutcomeStore, write_table
 
 Array = NDArray[np.float64]
@@ -274,7 +274,7 @@ def design(
             # without `resume` stored evaluations are taken too
             if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
-            with heard(comm, say) as progress:
+            with reporting_progress(comm, say) as progress:
                 return _designed(
                     Design(design_variables, goal, folder, comm, progress), Path(file), comm
                 )

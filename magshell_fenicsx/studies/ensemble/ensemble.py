@@ -145,10 +145,8 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     folder, name = user_folder(out), Path(file).name
     store, part_stores = _store(folder), [_store(Path(place)) for place in merge]
     if resume or merge:  # the folders must belong to this ensemble
-        access_disk(
-            comm,
-            lambda: _refuse_strange(part_stores or [store], samples_by_key, merge=bool(merge)),
-        )
+        stores = part_stores or [store]
+        access_disk(comm, lambda: _refuse_strange(stores, samples_by_key, merge=bool(merge)))
     tables = (
         f"summary{ending}.json",
         f"samples{ending}.csv",
@@ -158,29 +156,8 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
         access_disk(comm, lambda: _copy(samples_by_key, part_stores, store))
-    # an error may have been one of the machine
-    missing = (
-        []
-        if merge
-        else store.missing(
-            samples_by_key.values(),
-            comm,
-            lambda outcome: outcome.serves(scalar) and not outcome.is_error,
-        )
-    )
-    ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
-    say_on_first_rank(say, comm)(
-        f"{len(samples_by_key)} samples, {len(missing)} to compute on {ranks}"
-    )
-    folds = KnownFolds()
-    compute_points(
-        missing,
-        lambda sample: solve(sample, scalar, folds),
-        store,
-        comm,
-        say,
-        words=lambda outcome: _words(outcome, scalar),
-    )
+    else:
+        _compute_missing(samples_by_key, scalar, store, comm, say)
     rows = [_row(sample_variants, store, scalar) for sample_variants in zip(*variants, strict=True)]
     content = {
         "case": name,
@@ -195,6 +172,37 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     }
     access_disk(comm, lambda: _write(rows, content, folder, ending))
     return Ensemble(rows, content)
+
+
+def _compute_missing(
+    samples_by_key: Mapping[str, Sample],
+    scalar: Scalar,
+    store: OutcomeStore[Outcome],
+    comm: MPI.Intracomm,
+    say: Say,
+) -> None:
+    """Compute the samples whose outcome is not in the store; collective, each rank has its own.
+
+    A sample that ended with an error is computed again: the error may have been one of the machine.
+    """
+    missing = store.missing(
+        samples_by_key.values(),
+        comm,
+        lambda outcome: outcome.serves(scalar) and not outcome.is_error,
+    )
+    ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
+    say_on_first_rank(say, comm)(
+        f"{len(samples_by_key)} samples, {len(missing)} to compute on {ranks}"
+    )
+    folds = KnownFolds()
+    compute_points(
+        missing,
+        lambda sample: solve(sample, scalar, folds),
+        store,
+        comm,
+        say,
+        words=lambda outcome: _words(outcome, scalar),
+    )
 
 
 def _words(outcome: Outcome, scalar: Scalar) -> str:

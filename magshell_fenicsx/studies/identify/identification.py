@@ -50,7 +50,12 @@ from magshell_fenicsx.studies.identify.picture import draw_identified
 from magshell_fenicsx.studies.identify.predictor import Predictor, source_with_numbers
 from magshell_fenicsx.studies.identify.programme_input import programme
 from magshell_fenicsx.studies.identify.programmes import Programme
-from magshell_fenicsx.studies.identify.remanence_field import NAME, field_of, flux_density
+from magshell_fenicsx.studies.identify.remanence_field import (
+    NAME,
+    RemanenceField,
+    field_of,
+    flux_density,
+)
 from magshell_fenicsx.studies.identify.result_names import ResultNames
 from magshell_fenicsx.studies.identify.sections import IdentifySection
 from magshell_fenicsx.studies.identify.sentences import sentences
@@ -150,12 +155,7 @@ def identify(
         ]
         _refuse_few(table, parameters)
         _refuse_priors(extended_source, parameters, make_case)
-        programmes = [
-            programme(
-                name, extended_source, parameters, item, make_case, with_field=field is not None
-            )
-            for name, item in section.predict.items()
-        ]
+        programmes = _programmes(section, extended_source, parameters, make_case, field)
         with FOLDER.locked(folder, comm, name):
             say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
             # predictions do not change the fit, whose stored evaluations stay valid
@@ -187,6 +187,33 @@ def identify(
     for line in identified.content["said"]:
         say_on_first_rank(line)
     return identified
+
+
+def _programmes(
+    section: IdentifySection,
+    source: Source,
+    parameters: Sequence[Parameter],
+    make_case: MakeCase,
+    field: RemanenceField | None,
+) -> list[Programme]:
+    """Return the programmes of `identify.predict`, whose results are predicted; collective.
+
+    Parameters
+    ----------
+    source
+        The identified case.
+    field
+        The remanence field that is identified; None if there is none.
+
+    Raises
+    ------
+    CaseError
+        As `programme`.
+    """
+    return [
+        programme(name, source, parameters, item, make_case, with_field=field is not None)
+        for name, item in section.predict.items()
+    ]
 
 
 def _without_predictions(source: Source) -> Source:

@@ -20,7 +20,13 @@ from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.environment import code_version, machine_fingerprint
 from magshell_fenicsx.platform.processes import mpirun_path
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.studies.points import MakeCase, make_points, parse_axes, swept_source
+from magshell_fenicsx.studies.points import (
+    MakeCase,
+    SweepPoint,
+    make_points,
+    parse_axes,
+    swept_source,
+)
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import Say, compute
 from magshell_fenicsx.studies.store import Folder
@@ -111,46 +117,10 @@ def study(  # noqa: PLR0913 - what a user gives
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
     points = make_points(swept_source(Path(file), axes, settings), axes, make_case)
-    folder, machine = user_folder(out), machine_fingerprint()
+    folder = user_folder(out)
     with FOLDER.locked(folder, MPI.COMM_WORLD, Path(file).name):
-        counts = sorted(set(ranks))
-        origins = [{"sources": code_version(), **point.case.outside} for point in points]
-        # sources and mesh file of each point, whose measurements alone are used; and
-        # (index of a point, number of ranks) -> file of its measurements
-        files = {
-            (i, rank_count): folder / "points" / f"{points[i].key}-{rank_count}.json"
-            for i in range(len(points))
-            for rank_count in counts
-        }
-        if known_count := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
-            say(
-                f"{known_count} of {len(files)} computed again: the folder has results of other "
-                "sources of magshell_fenicsx"
-            )
-        runs = {
-            (i, rank_count): Run(points[i], rank_count, load(kept_in, machine, origins[i]))
-            for (i, rank_count), kept_in in files.items()
-        }
-
-        def point_measured(key: tuple[int, int]) -> Iterator[str]:
-            """Measure a point on a number of ranks, and yield a line of text.
-
-            The key is the index of the point, and the number of ranks.
-            """
-            (i, rank_count), run = key, runs[key]
-            run_settings = [
-                *settings,
-                *(f"{name}={value}" for name, value in run.point.values.items()),
-            ]
-            arguments = [
-                str(file),
-                *(word for setting in run_settings for word in ("--set", setting)),
-            ]
-            complete(run.measured, arguments, rank_count, repeat, files[key], origins[i])
-            yield f"{i + 1:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}"
-
-        compute([*runs], point_measured, MPI.COMM_SELF, say)
-        rows, reference_value = make_rows([*runs.values()], scalar, reference)
+        runs = _run_all(Path(file), points, settings, scalar, ranks, repeat, folder, say)
+        rows, reference_value = make_rows(runs, scalar, reference)
         # of study.json
         content = {
             "case": Path(file).name,
@@ -160,7 +130,7 @@ def study(  # noqa: PLR0913 - what a user gives
             "reference": asdict(reference_value) if reference_value else None,
             "reference_said": reference_sentence(reference_value),
             "repeat": repeat,
-            "machine": machine,
+            "machine": machine_fingerprint(),
         }
         study_result = Study(rows, reference_value)
         access_disk(
@@ -168,6 +138,56 @@ def study(  # noqa: PLR0913 - what a user gives
         )
     say(reference_sentence(reference_value))
     return study_result
+
+
+def _run_all(
+    file: Path,
+    points: Sequence[SweepPoint],
+    settings: Sequence[str],
+    scalar: Scalar,
+    ranks: Sequence[int],
+    repeat: int,
+    folder: Path,
+    say: Say,
+) -> list[Run]:
+    """Measure all points on all numbers of ranks, and return their runs.
+
+    The runs of a point on rising numbers of ranks follow each other. Measurements in the folder
+    count if they are of this machine, of these sources, and of the point's mesh file.
+    """
+    machine = machine_fingerprint()
+    origins = [{"sources": code_version(), **point.case.outside} for point in points]
+    # (index of a point, number of ranks) -> file of its measurements
+    files = {
+        (i, rank_count): folder / "points" / f"{points[i].key}-{rank_count}.json"
+        for i in range(len(points))
+        for rank_count in sorted(set(ranks))
+    }
+    if known_count := sum(of_others(path, origins[i]) for (i, _), path in files.items()):
+        say(
+            f"{known_count} of {len(files)} computed again: the folder has results of other "
+            "sources of magshell_fenicsx"
+        )
+    runs = {
+        (i, rank_count): Run(points[i], rank_count, load(path, machine, origins[i]))
+        for (i, rank_count), path in files.items()
+    }
+
+    def point_measured(key: tuple[int, int]) -> Iterator[str]:
+        """Measure a point on a number of ranks, and yield a line of text.
+
+        The key is the index of the point, and the number of ranks.
+        """
+        (i, rank_count), run = key, runs[key]
+        settings_of_point = [f"{name}={value}" for name, value in run.point.values.items()]
+        arguments = [str(file)]
+        for setting in (*settings, *settings_of_point):
+            arguments += ["--set", setting]
+        complete(run.measured, arguments, rank_count, repeat, files[key], origins[i])
+        yield f"{i + 1:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}"
+
+    compute([*runs], point_measured, MPI.COMM_SELF, say)
+    return [*runs.values()]
 
 
 def parse_ranks(text: str) -> list[int]:

@@ -317,7 +317,7 @@ def with_earlier(
         raise CaseError(
             f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}"
         )
-    write_object(folder / NAME, asdict(Listed(keys, base, [*earlier_only, *new_values])))
+    write_object(folder / NAME, asdict(SweepContent(keys, base, [*earlier_only, *new_values])))
     return [*(make_point(source, axes, values, make_case) for values in earlier_only), *points]
 
 
@@ -328,7 +328,7 @@ def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Listed:
+class SweepContent:
     """Content of sweep.json.
 
     Attributes
@@ -372,7 +372,7 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
             )
         return []
     try:
-        stored_sweep = TypeAdapter(Listed).validate_python(read_object(file))
+        stored_sweep = TypeAdapter(SweepContent).validate_python(read_object(file))
     except ValidationError:
         stored_sweep = None
     if stored_sweep is None or any(
