@@ -386,6 +386,8 @@ class Amplitude:
         Whether the curve has the value on the x axis, and the conjugate on the y axis.
     each
         Whether there may be several such parameters, whose columns have their names at the end.
+    components
+        Further amplitudes of the same load, across its first direction, which a step may turn.
     """
 
     name: str
@@ -394,3 +396,4 @@ class Amplitude:
     place: str = "of the pole"
     sideways: bool = False
     each: bool = False
+    components: tuple[str, ...] = ()

@@ -226,15 +226,16 @@ AMPLITUDES = {
         Amplitude("pressure", "p_over_pc", "volume_change"),
         Amplitude("force", "force", "w_over_h", "at the load"),
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
-        Amplitude("lambda_m", "lambda_m"),
+        Amplitude("lambda_m", "lambda_m", components=("lambda_across", "lambda_third")),
         Amplitude("angle", "field_angle", sideways=True),
         Amplitude("time", "time", sideways=True),
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
+INTERNAL = ("push", "membrane", "couple")
 # Names that neither a user-defined energy nor a factor may have.
 RESERVED_NAMES = {*AMPLITUDES, *INTERNAL}
+RESERVED_NAMES.update(name for a in AMPLITUDES.values() for name in a.components)
 
 
 def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
@@ -354,6 +355,19 @@ def amplitude(name: str) -> Amplitude:
             column, conjugate = family.column + suffix, family.conjugate + suffix
             return replace(family, name=name, column=column, conjugate=conjugate)
     return Amplitude(name, name)
+
+
+def principal(name: str) -> str:
+    """Return the amplitude along the first direction of a load, of one of its components.
+
+    Any other name is returned as it is.
+
+    Examples
+    --------
+    >>> principal("lambda_across"), principal("pressure")
+    ('lambda_m', 'pressure')
+    """
+    return next((a.name for a in AMPLITUDES.values() if name in a.components), name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:

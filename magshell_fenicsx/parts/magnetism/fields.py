@@ -33,6 +33,7 @@ from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_ave
 from magshell_fenicsx.parts.revolution_sections import SurfaceSection
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.quantities.quantity import CaseSizes
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ MIN_LAMBDA, MAX_LAMBDA = (
     1e-12,
     10.0,
 )  # of lambda_m: rounding, and a thousand times what destabilises a shell
+FIELD = amplitude("lambda_m")  # the field's strength along its first direction
 ANGLE = "angle"  # amplitude of a step that turns the field
 
 
