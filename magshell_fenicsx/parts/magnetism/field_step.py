@@ -124,6 +124,11 @@ class FieldSection(FactorStep):
         return direction, float(direction @ field_at(step_start.mu))
 
     @classmethod
+    def strength(cls, context: Context) -> float | None:
+        """Return the strength of the case's field, which may be 0; None without its section."""
+        return strength(context) if context.section_of(MagneticSection) else None
+
+    @classmethod
     def asked_for(cls, context: Context) -> bool:
         """Return whether the case has a field."""
         return bool(strength(context))

@@ -13,6 +13,7 @@ or, of a shell that is soft alone, over √(μ0 E).
 """
 
 from collections.abc import Sequence
+from math import copysign
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -95,8 +96,9 @@ class FieldObservables(Observables):
             field_size,
         )
 
-        angle = field_angle(state.mu, view.loads.magnetic, view.sense)
-        return {FIELD.column: field_size(state.mu, view.sense), "field_angle": angle}
+        sense = copysign(1.0, view.strengths.get(FIELD.name, 1.0))
+        angle = field_angle(state.mu, view.loads.magnetic, sense)
+        return {FIELD.column: field_size(state.mu, sense), "field_angle": angle}
 
 
 def moment_in_summary(view: ModelView, state: "State") -> dict[str, Any]:
