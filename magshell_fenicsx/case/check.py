@@ -14,6 +14,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.parts.magnetism.fields import GROUPS, dimensionless_groups
 from magshell_fenicsx.parts.magnetism.interaction import refuse_large
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
@@ -23,6 +24,7 @@ from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.mesh_sizes import degree_of
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.problem.surface_names import open_edges
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.overlap import refuse_overlap
 
 
@@ -110,9 +112,9 @@ def _number_lines(case: Case, problem: Problem) -> list[str]:
         "R/h": 1 / material.h,
         "nu": material.nu,
         "p_c/E": material.classical_pressure,
-        "lambda_m": case.lambda_m,
-        "Lambda_m = lambda_m R/h": case.lambda_m / material.h,
     }
+    groups = dimensionless_groups(case.context, 1 / material.h)
+    numbers |= {GROUPS[name]: value for name, value in groups.items()}
     # p_c is left out for a flat shell, unless it is the unit of a pressure
     is_flat = case.context.shell.geometry in FLAT_GEOMETRIES and not problem.loads.pressure
     if is_flat:
@@ -158,7 +160,11 @@ def _in_units(case: Case, without: str) -> list[str]:
         "2πD/R": ("2 pi D/R", "N"),
         "λ_m": ("applied field", sizes.field),
     }
-    factor = {"λ_m": case.lambda_m}  # the size of this scale is the field of lambda_m = 1
+    # of a load whose strength the case gives, the size of its scale is that of a strength of one
+    factor = {
+        quantity(amplitude(name).column).scale: strength
+        for name, strength in case.context.strengths.items()
+    }
     shown_scales = {
         scale: words
         for scale, words in words_and_units.items()

@@ -257,7 +257,6 @@ def _problem(
         reactions=bool(loads.moves) if case.reactions is None else case.reactions,
         body_contacts=tuple((region.size, region.reach) for region in mesh.contact_regions),
         warnings=_warnings(case, places),
-        lambda_m=case.lambda_m,
         unknowns=unknowns,
         patched=bool(case.patches),
         stability=case.stability,

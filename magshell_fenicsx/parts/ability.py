@@ -117,6 +117,13 @@ class Context:
         return abilities_of(self)
 
     @property
+    def strengths(self) -> dict[str, float]:
+        """Amplitude -> its value at a factor of one, of loads whose strength a section gives."""
+        from magshell_fenicsx.parts.registered import strengths_of  # knows all steps
+
+        return strengths_of(self)
+
+    @property
     def missing_offers(self) -> "dict[Offer, str]":
         """The offers that the case lacks -> advice how to get each of them.
 

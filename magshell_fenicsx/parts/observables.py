@@ -47,10 +47,10 @@ class ModelView:
         Plane of the half that is modelled, None for all; and azimuth of the model's frame (rad).
     reactions
         Whether reactions of all supports are reported.
-    sense
-        Sign of the case's field.
     points
         Names of the points of the case.
+    strengths
+        Amplitude -> its value at a factor of one, of loads whose strength the case gives.
     """
 
     model: "ObservedModel"
@@ -59,8 +59,8 @@ class ModelView:
     mirror: Mirror | None
     azimuth: float
     reactions: bool
-    sense: float = 1.0
     points: Sequence[str] = ()
+    strengths: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def loads(self) -> "Loads":

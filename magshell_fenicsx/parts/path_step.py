@@ -366,6 +366,14 @@ class FactorStep(LoadStep):
         raise NotImplementedError
 
     @classmethod
+    def strength(cls, context: Context) -> float | None:
+        """Return the amplitude at a factor of one if a section gives it; None if it is 1.
+
+        Cases that differ by it alone have one model.
+        """
+        return None
+
+    @classmethod
     def steps_before_load(cls, context: Context) -> list[tuple[str, Step]]:
         """Return the step that lets the factor grow to 1 before the only load of a case.
 

@@ -8,8 +8,10 @@ from typing import get_args
 
 from magshell_fenicsx.parts.ability import Ability, Context, Part
 from magshell_fenicsx.parts.observables import Observables
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.registry import registered_classes
 from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.quantities.registry import amplitude
 
 ABILITY_CLASSES: tuple[type[Ability], ...] = registered_classes("abilities")
 PART_CLASSES: dict[str, type[Part]] = {  # by their keys in a case
@@ -20,6 +22,9 @@ STEPS: dict[str, type[Step]] = {  # by their kinds
     for step_class in registered_classes("steps")
     for kind in get_args(step_class.model_fields["kind"].annotation)
 }
+FACTORS = [  # what grows to a factor
+    step_class for step_class in STEPS.values() if issubclass(step_class, FactorStep)
+]
 FORMER_KINDS = (("fold", "crease"),)  # of steps in older case files, with the present ones
 OBSERVABLES: tuple[Observables, ...] = tuple(
     observables_class() for observables_class in registered_classes("observables")
@@ -35,6 +40,31 @@ def step_class_of(name: str) -> type[Step]:
         for step_class in STEPS.values()
         if getattr(step_class, "amplitude", None) == name
     )
+
+
+def strengths_of(context: Context) -> dict[str, float]:
+    """Return amplitude -> its value at a factor of one, of loads whose strength a section gives."""
+    strengths = {step_class.amplitude: step_class.strength(context) for step_class in FACTORS}
+    return {name: strength for name, strength in strengths.items() if strength is not None}
+
+
+def section_of_strength(name: str) -> str:
+    """Return the key of the section that gives the strength of a load, by its amplitude."""
+    return next(step_class.section for step_class in FACTORS if step_class.amplitude == name)
+
+
+def strength_ratios(old: Context, new: Context) -> dict[str, float]:
+    """Return amplitude -> strength of a load in a case over that in another, where they differ.
+
+    The components of a load have its ratio. A load that is zero in the old case has none.
+    """
+    new_strengths, ratios = strengths_of(new), dict[str, float]()
+    for name, strength in strengths_of(old).items():
+        new_strength = new_strengths.get(name, 0.0)
+        if strength and new_strength != strength:
+            names = (name, *amplitude(name).components)
+            ratios |= dict.fromkeys(names, new_strength / strength)
+    return ratios
 
 
 def abilities_of(context: Context) -> list[Ability]:

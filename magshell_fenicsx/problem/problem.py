@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import edges_of_inflated_rubber
@@ -220,8 +220,6 @@ class Problem:
         Messages about what is unphysical, or often meant in another way.
     within
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
-    lambda_m
-        |Br||Ba|/(mu_0 E); 0 without a field.
     unknowns
         Approximate number of unknowns, if the meridian is not modelled.
     patched
@@ -263,7 +261,6 @@ class Problem:
     reactions: bool = False
     warnings: tuple[str, ...] = ()
     within: Mapping[str, InsideRim] = field(default_factory=dict)
-    lambda_m: float = 0.0
     unknowns: float = 0.0
     patched: bool = False
     stability: StabilitySection | None = None
@@ -278,6 +275,11 @@ class Problem:
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Steps of the programme; before a single load the natural shape grows, then the field."""
         return tuple(self.context.steps)
+
+    @property
+    def lambda_m(self) -> float:
+        """Strength |Br||Ba|/(mu_0 E) of the applied field; 0 without one."""
+        return strength(self.context)
 
     @property
     def listed(self) -> bool:

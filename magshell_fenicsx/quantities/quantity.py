@@ -41,7 +41,7 @@ class CaseSizes:
     R, E, rho
         Radius (m), Young's modulus (Pa) and density (kg/m³).
     applied, strength
-        Applied flux density (mT), or strength of the sources (%), of lambda_m = 1.
+        Applied flux density (mT), or strength of the sources (%), of a field strength of one.
     second
         The unit of time (s).
     """
@@ -278,9 +278,9 @@ class Quantity:
 
         Examples
         --------
-        >>> symbols = ("p/p_c", "λ_m", "ΔV/R³")
+        >>> symbols = ("p/p_c", "ω_1", "ΔV/R³")
         >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in symbols]
-        ['p/pc', 'lambda_m', 'dV/R^3']
+        ['p/pc', 'omega_1', 'dV/R^3']
         """
         return plain_text(re.sub(r"(?<=[A-Za-z])_", "", self.symbol)) or self.words
 
@@ -386,6 +386,15 @@ class Amplitude:
         Whether the curve has the value on the x axis, and the conjugate on the y axis.
     each
         Whether there may be several such parameters, whose columns have their names at the end.
+    components
+        Further amplitudes of the same load, across its first direction, which a step may turn.
+    turned
+        The load that it turns, of an angle, which itself is no parameter of the energy.
+    critical
+        Names of its value at the first instability as a number of a run: over its unit, and with
+        units; empty without.
+    history
+        Its name in the histories of a step in time, of a field; empty if that is its own name.
     """
 
     name: str
@@ -394,3 +403,12 @@ class Amplitude:
     place: str = "of the pole"
     sideways: bool = False
     each: bool = False
+    components: tuple[str, ...] = ()
+    turned: str = ""
+    critical: tuple[str, ...] = ()
+    history: str = ""
+
+    @property
+    def is_field(self) -> bool:
+        """Whether it is strength or direction of a field in space, which has no conjugate."""
+        return bool(self.components or self.turned)

@@ -223,18 +223,30 @@ QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *IN_TIME)}
 AMPLITUDES = {
     a.name: a
     for a in (
-        Amplitude("pressure", "p_over_pc", "volume_change"),
+        Amplitude(
+            "pressure",
+            "p_over_pc",
+            "volume_change",
+            critical=("knockdown", "buckling_pressure_Pa"),
+        ),
         Amplitude("force", "force", "w_over_h", "at the load"),
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
-        Amplitude("lambda_m", "lambda_m"),
-        Amplitude("angle", "field_angle", sideways=True),
+        Amplitude(
+            "lambda_m",
+            "lambda_m",
+            components=("lambda_across", "lambda_third"),
+            critical=("critical_field", "critical_field_mT"),
+            history="field",
+        ),
+        Amplitude("angle", "field_angle", sideways=True, turned="lambda_m"),
         Amplitude("time", "time", sideways=True),
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
+INTERNAL = ("push", "membrane", "couple")
 # Names that neither a user-defined energy nor a factor may have.
 RESERVED_NAMES = {*AMPLITUDES, *INTERNAL}
+RESERVED_NAMES.update(name for a in AMPLITUDES.values() for name in a.components)
 
 
 def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
@@ -354,6 +366,27 @@ def amplitude(name: str) -> Amplitude:
             column, conjugate = family.column + suffix, family.conjugate + suffix
             return replace(family, name=name, column=column, conjugate=conjugate)
     return Amplitude(name, name)
+
+
+def field_columns() -> tuple[str, ...]:
+    """Return the columns of the strengths of fields in space.
+
+    Fields are a part of the shell's surroundings: they are shown beside the load that varies.
+    """
+    return tuple(a.column for a in AMPLITUDES.values() if a.components)
+
+
+def principal(name: str) -> str:
+    """Return the amplitude along the first direction of a load, of one of its components.
+
+    Any other name is returned as it is.
+
+    Examples
+    --------
+    >>> principal("lambda_across"), principal("pressure")
+    ('lambda_m', 'pressure')
+    """
+    return next((a.name for a in AMPLITUDES.values() if name in a.components), name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:

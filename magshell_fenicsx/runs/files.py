@@ -63,12 +63,13 @@ from magshell_fenicsx.output.store.stored_results import read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
 from magshell_fenicsx.parts.magnetism.field_maps import maps_at
 from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.quantities.registry import field_columns
 from magshell_fenicsx.simulate.scene import Scene
 
 INTERRUPTION = re.compile(r"^interrupted by |cannot be (written|read): ")
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9  # of recomputed values in path.csv
 CUT_OFF = "it is cut off, or missing"
-COMPARED_COLUMNS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
+COMPARED_COLUMNS = ("p_over_pc", *field_columns(), "force", "w_over_h", "w_pole_over_h")
 
 
 class AlreadyComplete(Exception):

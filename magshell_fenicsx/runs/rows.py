@@ -18,6 +18,7 @@ from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
 from magshell_fenicsx.parts.step_course import SnapSection
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -61,7 +62,7 @@ class RowMaker:
         scene = record.scene or self._scene
         point, journal = record.point, self._scene.journal
         values = journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
-        is_field_step = self._is_programme and record.amplitude in ("lambda_m", "angle")
+        is_field_step = self._is_programme and amplitude(record.amplitude).is_field
         # w_from_field_over_h is measured from the last point of a field that comes before the loads
         if record.label in ("start", "field") or is_field_step:
             self._field_end = values["w_over_h"]

@@ -39,7 +39,7 @@ from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import format_number
-from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
+from magshell_fenicsx.quantities.registry import amplitude, field_columns, shown_quantity
 from magshell_fenicsx.runs.files import RunFiles, open_folder
 from magshell_fenicsx.runs.modes import frequencies_after, keeps_state, modes_after
 from magshell_fenicsx.runs.rows import RowMaker, imbalances, motion_errors
@@ -735,7 +735,7 @@ def _line(row: Row) -> str:
     elif conjugate.startswith("force_"):
         force_column = conjugate
     # the loads with their formats, and the fields of the line
-    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", force_column: "9.5f"}
+    formats = dict.fromkeys(field_columns(), "+.4e") | {"p_over_pc": ".6f", force_column: "9.5f"}
     fields = [f"{row['point']:4d} {row['label']:>11}"]
     if varied:
         fields.append(_value(varied, row, formats.get(varied, "9.5f")))

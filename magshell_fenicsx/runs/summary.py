@@ -23,6 +23,7 @@ from magshell_fenicsx.output.fields.mode_fields import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.run_identity import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.parts.magnetism.fields import dimensionless_groups
 from magshell_fenicsx.parts.magnetism.readings import moment_in_summary
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
@@ -277,21 +278,29 @@ class Result:
         steps = self.scene.problem.programme
         # steps that hold the conjugate of their own amplitude: of a pressure, the volume
         at_held_volume = {step.number for step in steps if step.name in step.load.hold}
-        for row in self._instabilities_under("pressure"):
+        for value, row in self._critical_loads("knockdown"):
             if row.get("step") not in at_held_volume:
-                return float(row["p_over_pc"])
+                return value
         return None
 
-    def _instabilities_under(self, name: str) -> list[Row]:
-        """Return the rows of instabilities of the path itself while the amplitude `name` varied."""
-        located = [row for row in self.rows if row["label"] in LOCATED]
-        return [row for row in located if row["amplitude"] == name and not row["branch"]]
+    def _critical_loads(self, name: str) -> list[tuple[float, Row]]:
+        """Return the loads at instabilities of the path itself, each with its row.
+
+        `name` is that of such a load as a number of a run, as `Amplitude.critical` has it.
+        """
+        rows = [row for row in self.rows if row["label"] in LOCATED and not row["branch"]]
+        loads = [amplitude(str(row["amplitude"])) for row in rows]
+        return [
+            (float(row[load.column]), row)
+            for load, row in zip(loads, rows, strict=True)
+            if name in load.critical
+        ]
 
     @property
     def critical_field(self) -> float | None:
         """λ_m at the first instability under the field; None if there is none."""
-        rows = self._instabilities_under("lambda_m")
-        return float(rows[0]["lambda_m"]) if rows else None
+        values = (value for value, _ in self._critical_loads("critical_field"))
+        return next(values, None)
 
     @property
     def value(self) -> float | None:
@@ -364,8 +373,7 @@ def _dimensionless_numbers(scene: Scene) -> dict[str, Any]:
     return {
         "radius_to_thickness": R_over_h,
         "poisson_ratio": material.nu,
-        "lambda_m": scene.problem.lambda_m,
-        "Lambda_m": scene.problem.lambda_m * R_over_h,
+        **dimensionless_groups(scene.problem.context, R_over_h),
         "pc_over_E": material.classical_pressure,
         "energy_unit": "E h R^2",
     }

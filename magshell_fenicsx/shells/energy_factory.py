@@ -70,8 +70,9 @@ from magshell_fenicsx.parts.joints import AMPLITUDE as FOLD
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.fields import FIELD
 from magshell_fenicsx.parts.magnetism.laws import LINEAR, full_density, magnetic_densities
-from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 from magshell_fenicsx.parts.natural.shape import Shape, grown
@@ -290,9 +291,9 @@ class EnergyFactory:
     def magnetic(self, field: Magnetisation) -> list[Energy]:
         """Return the energies of the shell's magnetisation in the applied field.
 
-        A remanence has the energy chosen in `field.energy`, linear in the field, with the amplitude
-        lambda_m. A soft magnet has one energy, quadratic in the field. A field in space is known by
-        its values at the displaced places; it is added to `fields`.
+        A remanence has the energy chosen in `field.energy`, linear in the field, whose strength is
+        its amplitude. A soft magnet has one energy, quadratic in the field. A field in space is
+        known by its values at the displaced places; it is added to `fields`.
         """
         applied = None
         if field.in_space:
@@ -410,7 +411,7 @@ class EnergyFactory:
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
-        """Return the energies of a remanence, linear in the applied field, with amplitude lambda_m.
+        """Return the energies of a remanence, linear in the applied field with its amplitudes.
 
         A field known by its values (`applied`) has one energy. Otherwise each uniform direction of
         the field has its own amplitude, and a field gradient one more energy. An approximate energy
@@ -424,15 +425,11 @@ class EnergyFactory:
             density = self._magnetised(
                 field, densities.in_space(full), Br, applied.polynomial, parts=VALUE_AND_FIRST
             )
-            return [domain.energy("magnetic", density, "lambda_m", column="magnetic")]
-        # amplitude, suffix of the energy's name, and vector of each uniform part of the field
-        directions = [("lambda_m", "", field.applied)]
-        for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False):
-            directions.append((name, name.replace("lambda_", " "), Ba))
+            return [domain.energy("magnetic", density, FIELD.name, column="magnetic")]
         # name -> density, of the exact energy or of the parts of an approximate one
         chosen_densities = magnetic_densities(field.law, field.energy, thins=thins)
         energies = []
-        for amplitude, suffix, Ba in directions:
+        for amplitude, suffix, Ba in field.uniform_parts:
             for name, density_function in chosen_densities.items():
                 energy = domain.energy(
                     name + suffix,
@@ -448,7 +445,7 @@ class EnergyFactory:
             gradient = self._constant(field.gradient)
             density = self._magnetised(field, in_gradient, Br, gradient, parts=VALUE_AND_FIRST)
             energies.append(
-                domain.energy("magnetic gradient", density, "lambda_m", column="magnetic")
+                domain.energy("magnetic gradient", density, FIELD.name, column="magnetic")
             )
         return energies
 

@@ -1,7 +1,7 @@
 """The axisymmetric shell as a system of terms on its meridian, and its displacement at one place.
 
 Lengths in R, energies in E h R^2, of the whole shell. Amplitudes (load parameters, by name) as in
-`ShellModel`: "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
+`ShellModel`, such as "pressure" (p/p_c) and "force" (F R/(2 pi D)).
 
 The meridian is the profile curve, with the parameter s; several shells with one axis e3 share one
 parameter. The displacement is u = (U, W) along e_rho and e_z. Ends are the boundary points of the

@@ -4,7 +4,7 @@ In go a mid-surface (mesh and placement r0), material, loads and edge conditions
 with its `system`, the equations that solvers take. Lengths are in R, energies in E h R^2.
 
 A term is a summand of the potential or of the virtual work. An amplitude is a load parameter, by
-name: "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m. A condition is the
+name, such as "pressure" (p/p_c) and "force" (F R/(2 pi D)). A condition is the
 support of an edge: "symmetry" puts the edge on the mirror plane of a half model or a sector,
 "plane" on another plane of symmetry. A growing imperfection is a deviation from the perfect surface
 that an amplitude scales. An opening is an edge where the pressed surface ends; a lid is the surface

@@ -43,7 +43,8 @@ from magshell_fenicsx.models.solid import body_densities
 from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
 from magshell_fenicsx.parts.magnetism import rotation_on_solid as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
-from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
+from magshell_fenicsx.parts.magnetism.fields import FIELD
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
@@ -185,8 +186,8 @@ class TermFactory:
     def magnetic(self, field: Magnetisation) -> list[SolidTerm]:
         """Return the terms of a remanence and of a soft magnet in the applied field.
 
-        The remanence's terms are linear in the field, with the amplitude lambda_m. A field in space
-        is known by its values at the displaced places; it is added to `fields`.
+        The remanence's terms are linear in the field, whose strength is their amplitude. A field in
+        space is known by its values at the displaced places; it is added to `fields`.
         """
         applied = None
         if field.in_space:
@@ -319,7 +320,7 @@ class TermFactory:
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[SolidTerm]:
-        """Return the terms of a remanence, linear in the applied field, with amplitude lambda_m.
+        """Return the terms of a remanence, linear in the applied field with its amplitudes.
 
         A field known by its values (`applied`) has one term. Otherwise each uniform direction of
         the field has its own amplitude, and a field gradient one more term.
@@ -337,15 +338,9 @@ class TermFactory:
                 (Br, applied.polynomial, *self._constants(self.h)),
                 VALUE + GRADIENT,
             )
-            return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
-        # amplitude, suffix of the term's name, and vector of each uniform part of the field
-        directions = [("lambda_m", "", field.applied)]
-        directions += [
-            (name, name.replace("lambda_", " "), Ba)
-            for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False)
-        ]
+            return [self._bulk("magnetic", density, FIELD.name, column="magnetic")]
         terms = []
-        for amplitude, suffix, Ba in directions:
+        for amplitude, suffix, Ba in field.uniform_parts:
             density = SolidDensity(law.magnetic, (Br, *self._constants(Ba, self.h)))
             term = self._bulk(
                 "magnetic" + suffix,
@@ -362,7 +357,7 @@ class TermFactory:
                 (Br, *self._constants(field.gradient, self.h)),
                 VALUE + GRADIENT,
             )
-            terms.append(self._bulk("magnetic gradient", density, "lambda_m", column="magnetic"))
+            terms.append(self._bulk("magnetic gradient", density, FIELD.name, column="magnetic"))
         return terms
 
     def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:

@@ -4,8 +4,8 @@ Times are over R sqrt(rho/E), the unit of time of the model.
 
 A history is a table or formula of the case: the values of one load at times. A level is one of its
 values, in the unit of the case. A curve is a function (t, before) -> value; `before` takes the
-value just before t, where it may jump. Marks are times of kinks and jumps. lambda_m is the strength
-of the magnetic field; an amplitude is a load parameter by name in `State.mu`.
+value just before t, where it may jump. Marks are times of kinks and jumps. An amplitude is a load
+parameter by name in `State.mu`; its strength is the amplitude at a factor of one.
 """
 
 from collections.abc import Callable, Collection
@@ -34,9 +34,7 @@ def dimensionless_time(problem: Problem, value: Time) -> float:
 
 def amplitude_of_level(problem: Problem, name: str, value: Level) -> float:
     """Return a value in a history of the case as an amplitude of the model."""
-    if name != "lambda_m":
-        return level_in(problem.context, name, value)
-    return problem.lambda_m * level_in(problem.context, "field", value)
+    return problem.context.strengths.get(name, 1.0) * level_in(problem.context, name, value)
 
 
 class LoadsInTime:
@@ -76,6 +74,7 @@ class LoadsInTime:
         # amplitude -> its history
         histories = dict(zip(load.drives, load.history.values(), strict=True))
         # unit of time, and amplitude -> load of the programme's step that varies it
+        strengths = problem.context.strengths
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
@@ -84,8 +83,8 @@ class LoadsInTime:
             # the amplitude at the begin, as a value of the history
             value = step.in_history(state.mu[name]) if step else state.mu[name]
             level = partial(amplitude_of_level, problem, name)
-            # a formula (text) gives the factor of the field; levels of a table include it already
-            strength = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
+            # a formula (text) gives a factor of the strength; levels of a table include it already
+            strength = strengths.get(name, 1.0) if isinstance(history, str) else 1.0
             self._curves[name] = _scaled(
                 curve(history, time_in_case_unit, level, value),  # in the case's unit of time
                 size=strength,

@@ -5,8 +5,7 @@ h or in the unit of a dimple's width change with these. States get its loads, an
 the same places.
 
 A key is the path of a number in the case's file, such as "magnetic.remanent.polar"; a section is a
-part of the file. Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`;
-lambda_m is the strength of the magnetic field.
+part of the file. Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,7 +19,9 @@ from magshell_fenicsx.input.section import is_length
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.kinds import LawKeys
+from magshell_fenicsx.parts.registered import section_of_strength, strength_ratios
 from magshell_fenicsx.parts.revolution_sections import MaterialSection
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import SceneCache, UnfitMesh
 
@@ -190,7 +191,7 @@ def state_with_new_loads(
     Raises
     ------
     CaseError
-        If the field of the first scene is zero and that of the second is not.
+        If a load of the first scene, such as the field, is zero, and that of the second is not.
     """
     # loads with targets: amplitude -> factor
     ratios = target_ratios(old, new, "load", steps)
@@ -206,14 +207,16 @@ def state_with_new_loads(
         for name, value in old_values.items()
         if value and name in new_values
     }
-    # amplitudes of the magnetic field
-    field_names = [name for name in state.mu if name.startswith("lambda_")]
-    if "lambda_m" in state.mu and new.problem.lambda_m != old.problem.lambda_m:
-        if not old.problem.lambda_m:
+    # loads whose strength the case gives
+    strengths, new_strengths = old.problem.context.strengths, new.problem.context.strengths
+    for name in strengths.keys() & state.mu.keys():
+        if new_strengths.get(name) and not strengths[name]:
+            words = quantity(amplitude(name).column).words
             raise CaseError(
-                "magnetic: a field of zero has no derivative by a number: take by: lambda_m"
+                f"{section_of_strength(name)}: a {words} of zero has no derivative by a number: "
+                f"take by: {name}"
             )
-        ratios |= dict.fromkeys(field_names, new.problem.lambda_m / old.problem.lambda_m)
+    ratios |= strength_ratios(old.problem.context, new.problem.context)
     mu = {
         name: value * (1.0 if name in dependent_names else ratios.get(name, 1.0))
         for name, value in state.mu.items()

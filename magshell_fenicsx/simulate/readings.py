@@ -37,7 +37,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.motion.motion_step import TimeSection
 from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.quantities.registry import amplitude, principal
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
@@ -236,8 +236,8 @@ class PrescribedQuantity:
     def _load_factor(self, other: Problem) -> float:
         """Return the load of a problem over that of the scene, as gradients scale it.
 
-        It is the ratio of the strengths of the field, or of the targets. The loads of states that
-        gradients compare are scaled alike (`simulate.perturbation.state_with_new_loads`).
+        It is the ratio of the strengths that the cases give, or of the targets. The loads of states
+        that gradients compare are scaled alike (`simulate.perturbation.state_with_new_loads`).
 
         Parameters
         ----------
@@ -245,8 +245,9 @@ class PrescribedQuantity:
             The same case with another number.
         """
         problem = self.scene.problem
-        if self.name.startswith("lambda_") and problem.lambda_m:
-            return other.lambda_m / problem.lambda_m
+        load_name = principal(self.name)
+        if strength := problem.context.strengths.get(load_name):
+            return other.context.strengths[load_name] / strength
         # a target is a pair of what it prescribes and its value
         old_target, new_target = self.step.load.end.target, other.programme[-1].load.end.target
         quantity = "conjugate" if self.by_conjugate else "load"

@@ -19,7 +19,6 @@ Words and symbols:
 import time
 from collections.abc import Callable
 from functools import cached_property
-from math import copysign
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -506,7 +505,6 @@ class Scene:
     def view(self) -> ModelView:
         """The model with the units and the frame of reports, for observables of parts."""
         problem = self.problem
-        sense = copysign(1.0, problem.lambda_m)  # of the magnetic field
         return ModelView(
             self.model,
             problem.length,
@@ -514,8 +512,8 @@ class Scene:
             problem.mirror,
             problem.azimuth,
             problem.reactions,
-            sense,
             tuple(problem.context.points),
+            problem.context.strengths,
         )
 
     def to_magpylib(self, record: Record, parts: int = 8) -> Any:

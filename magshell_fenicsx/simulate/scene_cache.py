@@ -36,7 +36,6 @@ from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.thickness import thickness_field
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
-from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.natural.shape import natural_field
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene, build_meridian_model
@@ -188,8 +187,8 @@ class SceneCache:
         self._forms = None
 
 
-def with_field_strength(scene: Scene, context: Context) -> Scene:
-    """Return the scene of a case that differs by the strength of the field alone.
+def with_strengths(scene: Scene, context: Context) -> Scene:
+    """Return the scene of a case that differs by the strengths of its loads alone.
 
     It has the same model and solver. Neither is built again.
 
@@ -198,8 +197,7 @@ def with_field_strength(scene: Scene, context: Context) -> Scene:
     context
         What the sections of the other case have made of its file.
     """
-    problem = replace(scene.problem, context=context, lambda_m=strength(context))
-    return scene.copied(problem=problem)
+    return scene.copied(problem=replace(scene.problem, context=context))
 
 
 def _symmetry(problem: Problem) -> tuple[object, ...]:
@@ -416,7 +414,6 @@ def problem_on_mesh_of(scene: Scene, new_problem: Problem) -> Problem:
     return replace(
         old,
         context=new_problem.context,
-        lambda_m=new_problem.lambda_m,
         body=new_problem.body,
         material=new_problem.material,
         loads=new_problem.loads,

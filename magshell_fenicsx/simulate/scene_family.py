@@ -37,6 +37,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.registered import strength_ratios
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
@@ -262,8 +263,8 @@ class SceneFamily:
 
         A term that is zero at the start, as a field may be, is missing in the first scene. If the
         scene at another value has more amplitudes, it becomes the origin of the family, and the
-        record's state is transferred to it. There the new amplitudes are zero, but lambda_m is the
-        strength of the field.
+        record's state is transferred to it. There a new load whose strength the case gives is
+        whole, and other new amplitudes are zero.
         """
         low, high = self._range
         step = TEST_DISTANCE * (high - low)
@@ -284,7 +285,8 @@ class SceneFamily:
         self._scenes = SceneCache(base=self._origin, moves_mesh=True)
         problem = self._origin.problem
         u, mu = transfer(old_origin, self._origin, old_state.u), dict(old_state.mu)
-        mu |= {name: problem.lambda_m if name == "lambda_m" else 0.0 for name in new_names}
+        strengths = problem.context.strengths
+        mu |= {name: strengths.get(name, 0.0) for name in new_names}
         point = replace(self._record.point, state=State(u, mu))
         self._record = replace(self._record, point=point, step=len(problem.programme))
         # a test value other than that of the new origin: the other candidate, if there is one
@@ -582,15 +584,10 @@ class SceneFamily:
             name for name, value in old_values.items() if value and mu.get(name) == value
         ]
         mu |= {name: new_values[name] for name in names_at_initial_value if name in new_values}
-        # components of the magnetic field
-        if old.lambda_m and new.lambda_m != old.lambda_m:
-            strength_ratio = new.lambda_m / old.lambda_m
-            mu |= {
-                name: strength_ratio * value
-                for name, value in mu.items()
-                if name.startswith("lambda_") and name != self.name
-            }
-        return mu
+        # loads whose strength the case gives, but that whose instability is followed
+        ratios = strength_ratios(old.context, new.context)
+        changing_names = (ratios.keys() & mu.keys()) - {self.name}
+        return mu | {name: ratios[name] * mu[name] for name in changing_names}
 
     def _depends_by_amplitudes_alone(self, value: float) -> bool:
         """Return whether p enters the forces by amplitudes alone; collective.

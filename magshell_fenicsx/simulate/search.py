@@ -33,6 +33,7 @@ from magshell_fenicsx.continuation.search import (
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import SearchSection
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.contact_control import before_passing, passes, with_own_contact
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -209,7 +210,7 @@ def search_at_end_of_step(
         held_conjugates = held_conjugates_of_step(scene, step, begin)
         stage = make_stage(scene, end, held_conjugates)
         # a step that turns the field has an angle, which is no amplitude of the state
-        name = step.name if step.name in end.mu else "lambda_m"
+        name = step.name if step.name in end.mu else amplitude(step.name).turned
         for record in _solutions(stage, name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 

@@ -15,7 +15,7 @@ Words and symbols:
   left null vector of the tangent at the fold. mu holds the amplitudes (load parameters) by name.
 - r0 is the undeformed mid-surface, a function of the chart (its coordinates). A deviation w0 is its
   distance from the perfect surface. A rim is the edge of a dimple; it may separate patches.
-- h and R are thickness and reference length; lambda_m is the strength of the magnetic field.
+- h and R are thickness and reference length.
 - A stage is a scene with the solver of one step, whose system may have further unknowns.
 - In a case of several shells each one is a member shell, with sections of its own.
 """
@@ -41,7 +41,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
     imperfection_geometries,
     in_frame,
 )
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.magnetism.fields import FIELD, MagneticSection
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.problem.problem import Problem
@@ -60,7 +60,7 @@ from magshell_fenicsx.simulate.stage import Stage, load_stage
 from magshell_fenicsx.simulate.steps import stage_of_record
 from magshell_fenicsx.simulate.transfer import transfer
 
-NONZERO_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
+NONZERO_FIELD = 1e-3  # strength of a field in which nothing is solved
 Array = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
 Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
@@ -83,11 +83,11 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     -------
     Derivatives by the name of the parameter, with all others fixed:
 
-    - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
+    - every other amplitude of the scene ("force", that of the field, of a user-defined term, ...);
     - "defect.amplitude", "imperfections.0.width", ...: numbers of imperfections;
     - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within
-      a dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m
-      times the derivative in lambda_m.
+      a dimple's rim or outside all ("remanence" where there is no dimple). Their sum is the
+      strength of the field times the derivative by it.
     """
     stage = stage_of_record(scene, record) if record else load_stage(scene)
     adjoint = adjoint_of_fold(stage, fold)
@@ -171,19 +171,16 @@ def _of_shells(scene: Scene, field: Magnetisation, count: int) -> dict[str, Mask
 
 
 def _by_absent_field(adjoint: Adjoint) -> dict[str, float]:
-    """Return "lambda_m" -> derivative by the strength of a field at lambda_m = 0; collective.
+    """Return the field's amplitude -> derivative by its strength where that is 0; collective.
 
     It serves a case whose section `magnetic` has the strength zero, so that the model has no such
     amplitude. Empty without this section, with another strength, and where the field would preserve
     less symmetry than the model has.
     """
     scene, problem, state = adjoint.scene, adjoint.scene.problem, adjoint.state
-    if problem.context.section_of(MagneticSection) is None or "lambda_m" in state.mu:
+    if problem.context.section_of(MagneticSection) is None or FIELD.name in state.mu:
         return {}
-    without_field = dict.fromkeys(  # None: not given, as lambda_m replaces them
-        ("magnetic.remanent.flux_density", "magnetic.applied.flux_density")
-    )
-    with_field = problem.with_values({"magnetic.lambda_m": NONZERO_FIELD, **without_field})
+    with_field = problem.with_values(MagneticSection.with_strength(NONZERO_FIELD))
     is_whole = not problem.axisymmetric and problem.mirror is None
     symmetry, symmetry_with_field = (
         (each.axisymmetric, each.mirror) for each in (problem, with_field)
@@ -192,13 +189,14 @@ def _by_absent_field(adjoint: Adjoint) -> dict[str, float]:
     if not is_whole and symmetry != symmetry_with_field:
         return {}
     column = _magnetic_column(scene, state, with_field.loads.magnetic)
-    return {"lambda_m": float(dot(scene.model.system.comm, adjoint.places[0].w, column))}
+    return {FIELD.name: float(dot(scene.model.system.comm, adjoint.places[0].w, column))}
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
-    """Return the load column lambda_m dPi/du of a magnetised shell, zero at supports; collective.
+    """Return the load column of a magnetised shell in its field, zero at supports; collective.
 
-    Without an amplitude lambda_m in the state its factor is 1.
+    It is the derivative of the energy by the displacement. Without an amplitude of the field in the
+    state, that of a field of strength one.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.quantities.registry import OWN_MODES
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.contact_control import passes, with_cuts_here, with_own_contact
@@ -426,8 +426,8 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
 
 
 def amount_of(name: str, state: State) -> float:
-    """Return the value of an amplitude at a state; lambda_m of a step that drives several."""
-    return state.mu.get(name, state.mu.get("lambda_m", 0.0))
+    """Return the value of an amplitude at a state; of an angle, that of the load that it turns."""
+    return state.mu.get(name, state.mu.get(amplitude(name).turned, 0.0))
 
 
 def _carried_over(

@@ -128,8 +128,8 @@ def trace(  # noqa: PLR0913
     Parameters
     ----------
     name
-        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of a
-        user-defined term.
+        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "load", that of the field, or
+        that of a user-defined term.
     start
         A record or a state; by default the undeformed shell with all amplitudes zero.
     control

@@ -6,7 +6,7 @@ A fold is a state at which the pressure is stationary along the path, found by N
 the state and the null vector phi of its tangent. An amplitude is a load parameter, by name; mu has
 those of a state, and u is the displacement. A scene is the model of a case with its solver. The
 inertia is the number of unstable directions. A sample is a random case, its values what was drawn.
-lambda_m is the size of the magnetic load.
+A strength is the size of a load that the case gives, as that of a magnetic field.
 """
 
 import json
@@ -21,7 +21,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_cache import SceneCache, with_field_strength
+from magshell_fenicsx.simulate.scene_cache import SceneCache, with_strengths
 from magshell_fenicsx.simulate.transfer import chart, matching, same_mesh, transfer
 from magshell_fenicsx.studies.ensemble.samples import Values
 from magshell_fenicsx.studies.points import Case
@@ -91,10 +91,10 @@ def _is_unstable(scene: Scene, fold: Fold) -> bool:
 def _constant_amplitudes(scene: Scene) -> dict[str, float]:
     """Return name -> value of the amplitudes that are constant while the pressure grows.
 
-    The magnetic field has its full strength by then; others are as in the unloaded state.
+    Loads have the strength that the case gives by then; others are as in the unloaded state.
     """
-    amplitudes = dict(scene.unloaded().mu)
-    return amplitudes | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in amplitudes else {})
+    amplitudes, strengths = dict(scene.unloaded().mu), scene.problem.context.strengths
+    return {name: strengths.get(name, value) for name, value in amplitudes.items()}
 
 
 class Continuation:
@@ -253,7 +253,7 @@ class KnownFolds:
             to be the first instability.
         """
         amplitudes = _constant_amplitudes(scene)
-        if amplitudes.keys() - {"pressure", "lambda_m"}:
+        if amplitudes.keys() - {"pressure", *scene.problem.context.strengths}:
             raise FoldLost("other amplitudes are driven before the pressure")
         nodes = chart(scene)
         # the nearest known fold on the same mesh is the first and only one that is tried
@@ -303,7 +303,7 @@ class KnownFolds:
 
 
 def scene_of(case: Case, scenes: SceneCache) -> Scene:
-    """Return the scene of a case; cases that differ by the strength of the field alone share one.
+    """Return the scene of a case; cases that differ by the strengths of loads alone share one.
 
     Raises
     ------
@@ -313,25 +313,16 @@ def scene_of(case: Case, scenes: SceneCache) -> Scene:
     scene = scenes.scene_at(
         _apart_from_strength(case), lambda: with_modes(case.problem(), scenes.comm)
     )
-    return with_field_strength(scene, case.context)
+    return with_strengths(scene, case.context)
 
 
 def _apart_from_strength(case: Case) -> str:
-    """Return a text of all that determines a scene but the size of lambda_m.
+    """Return a text of all that determines a scene but the strengths of loads.
 
-    That size is a load amplitude, which a scene can change. Flux densities that change nothing else
-    are left out.
+    A strength is an amplitude, which a scene can change; one of zero has no terms.
     """
     data = case.model_dump(mode="json") | case.outside
-    if magnetic := data.get("magnetic"):
-        # with both, the ratio of remanence and susceptibility counts: the flux density of the
-        # remanence stays
-        has_both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
-        magnetic.pop("lambda_m", None)
-        if magnetic["remanent"] and not has_both:
-            magnetic["remanent"].pop("flux_density", None)
-        # with magnets or coils as sources, the applied flux density is that of a further field
-        # beside theirs, and stays
-        if not case.sources:
-            magnetic["applied"].pop("flux_density", None)
-    return json.dumps([data, bool(case.lambda_m)], sort_keys=True)
+    if case.magnetic:
+        data["magnetic"] = case.magnetic.apart_from_strength()
+    are_there = {name: bool(strength) for name, strength in case.context.strengths.items()}
+    return json.dumps([data, are_there], sort_keys=True)

@@ -8,15 +8,23 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from magshell_fenicsx.quantities.registry import QUANTITIES, amplitude, endings, shown_quantity
+from magshell_fenicsx.quantities.registry import (
+    QUANTITIES,
+    amplitude,
+    endings,
+    field_columns,
+    quantity,
+    shown_quantity,
+)
 from magshell_fenicsx.studies.points import Axis, short_key
 
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
 NAMES = {  # words and symbol of keys
-    "lambda_m": ("field", r"$\lambda_\mathrm{m}$"),
     "poisson_ratio": ("Poisson's ratio", r"$\nu$"),
     "radius_to_thickness": ("radius over thickness", "$R/h$"),
     "youngs_modulus": ("Young's modulus", "$E$"),
+    # the strength of a field has the same name in a case and in path.csv
+    **{name: (quantity(name).words, quantity(name).latex) for name in field_columns()},
 }
 
 
@@ -77,8 +85,8 @@ def key_symbol(key: str) -> str:
 
     Examples
     --------
-    >>> key_symbol("magnetic.lambda_m"), key_symbol("mesh.degree")
-    ('$\\lambda_\\mathrm{m}$ = ', 'degree ')
+    >>> key_symbol("shell.poisson_ratio"), key_symbol("mesh.degree")
+    ('$\\nu$ = ', 'degree ')
     """
     symbol = NAMES.get(short_key(key), ("", ""))[1]
     return f"{symbol} = " if symbol else f"{key_words(key)} "

@@ -22,6 +22,7 @@ import numpy as np
 
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.parts.magnetism.interaction import has_effect
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 
 # what the front end makes of a source; `problem()` makes its problem: a study does not know its
@@ -289,22 +290,13 @@ def make_point(
     return SweepPoint(values_by_key, case, identity(case))
 
 
-def _has_magnetic_effect(case: Case) -> bool:
-    """Return whether the magnetic section of a case has an effect on any result."""
-    if case.lambda_m:  # the size of the magnetic load
-        return True
-    if case.sensors or case.field_maps:
-        return True
-    return case.magnetic is not None and case.magnetic.interaction != "none"
-
-
 def identity(case: Case) -> str:
     """Return a hash of the problem: of the case with its defaults, and of its mesh file.
 
     A magnetic section that has no effect does not count, as one with a field of zero.
     """
     data = case.model_dump(mode="json") | case.outside
-    if not _has_magnetic_effect(case):
+    if not has_effect(case.context):
         del data["magnetic"]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -1,9 +1,9 @@
 """The number of a run that `--result` names: a scalar.
 
 It is a number of summary.json, or COLUMN@COLUMN=VALUE: a column of path.csv at the point of the
-path where another column (the place) first has a value. A critical field is the value of lambda_m,
-the size of the magnetic load, at an instability; a snap is a jump of a motion in time. Rows of
-branches and of excluded modes are no part of the path.
+path where another column (the place) first has a value. A critical field is its strength at an
+instability; a snap is a jump of a motion in time. Rows of branches and of excluded modes are no
+part of the path.
 """
 
 import math
@@ -18,7 +18,7 @@ from scipy.interpolate import barycentric_interpolate
 import magshell_fenicsx.parts.registered  # noqa: F401  the columns of parts are in the registry
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
-from magshell_fenicsx.quantities.registry import OWN_MODES, QUANTITIES, quantity
+from magshell_fenicsx.quantities.registry import OWN_MODES, QUANTITIES, amplitude, quantity
 
 # columns of single things: a named point or support, a second load, and the displacement at a load
 SINGLE_COLUMNS = re.compile(
@@ -66,7 +66,7 @@ class Scalar:
             points = (
                 point["value"]
                 for point in summary["limit_points"]
-                if point["amplitude"] == "lambda_m"
+                if self.name in amplitude(point["amplitude"]).critical
             )
             return _number(next(points, None))
         if self.name in OF_SNAPS:

@@ -5,14 +5,14 @@ by name, as `surface.Surface` has them. The theory is in docs/theory.md.
 
 - A jet is a map with its first and second derivatives by coordinates at points.
 - h and R are thickness and reference length; lengths are over R.
-- Br and Ba are remanence and applied flux density, mu the amplitudes (load parameters) of a state,
-  lambda_m = |Br||Ba|/(mu_0 E).
+- Br and Ba are remanence and applied flux density, mu the amplitudes (load parameters) of a state.
+  The strength of the field is |Br||Ba|/(mu_0 E).
 - A field acts on a thin shell by a pressure p_mag, an in-plane force f_mag, rotational springs k
   and a torque tau. B0 = -Br (x) Ba is their tensor.
 - The remanence law is "deformation" (Br is convected) or "rotation" (Br turns and does not
   stretch).
 - The arrays E and M are the components 11, 12, 22 of membrane strain and bending moment; in a unit
-  such as h E lambda_m, E is Young's modulus, and D is the bending stiffness.
+  such as h E, E is Young's modulus, and D is the bending stiffness.
 - a0_a is the tangent basis of the undeformed surface, a0^a its dual basis, n0 its normal, b0 its
   curvature.
 - The natural shape is the one that the shell would have without stress; its growth is given by two
@@ -48,9 +48,9 @@ def magnetic_loads(
 ) -> tuple[dict[str, Array], "Torque"]:
     """Return the magnetic loads p_mag, k and f_mag, and the torque of the displacement.
 
-    Br and Ba are of unit length: p_mag and f_mag are over E lambda_m, k and the torque over h E
-    lambda_m. f_mag is there only if the remanence and the thickness are uniform. The formulas are
-    in docs/theory.md.
+    Br and Ba are of unit length: p_mag and f_mag are over E, k and the torque over h E, times the
+    field's strength. f_mag is there only if the remanence and the thickness are uniform. The
+    formulas are in docs/theory.md.
 
     Parameters
     ----------
@@ -452,7 +452,8 @@ class PointFields:
         -------
         Br, Ba
             (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux
-            density at the deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
+            density at the deformed point, over mu_0 E / |Br|, so that its magnitude is its
+            strength.
         J
             (..., 3) the polarisation mu_0 M that the field induces in soft magnetic material, in
             the same unit.

@@ -30,7 +30,8 @@ from magshell_fenicsx.output.fields.surface import (
 )
 from magshell_fenicsx.output.store.durable import damage, errors_as_damage, write_whole
 from magshell_fenicsx.output.store.table import read_rows
-from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
+from magshell_fenicsx.parts.magnetism.fields import FIELD
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -43,13 +44,14 @@ VTK_TENSOR_POSITIONS = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to 
 JUMPS = ("moment_jump", "strain_jump")
 SHELLS = "shells"  # names of the shells, in the order of the numbers in `shell`
 DATA_OF_SURFACE = ("u", "u_over_h", "w_over_h", "r0", "n0")
+STRENGTH = quantity(FIELD.column).ascii_symbol  # of the applied field
 UNITS = {  # of the arrays, for those who open the files in other programs
     **dict.fromkeys(("points", "u", "r0"), "R"),
     **dict.fromkeys(("u_over_h", "w_over_h", "w0_over_h", "gap_over_h"), "h"),
     **dict.fromkeys(("n0", "E", "E_1", "E_2", "E_total"), "1"),
     **dict.fromkeys(("M", "M_1", "M_2"), "D/R"),
-    **dict.fromkeys(("p_mag", "f_mag"), "E lambda_m"),
-    **dict.fromkeys(("k", "tau"), "h E lambda_m"),
+    **dict.fromkeys(("p_mag", "f_mag"), f"E {STRENGTH}"),
+    **dict.fromkeys(("k", "tau"), f"h E {STRENGTH}"),
     "Br": "largest remanence",
     "Ba": "mu0 E / largest remanence",
     "contact_pressure": "E h/R",

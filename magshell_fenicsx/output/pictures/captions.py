@@ -2,8 +2,8 @@
 
 A row is a line of path.csv, by column. An amplitude is a load parameter, by name; its value is in
 the column of the amplitude. Lengths on a picture are in points, 1/72 inch. A text is a box with a
-middle and half a size, that is half of its width and height. lambda_m measures the magnetic field;
-h, R and nu are thickness, reference length and Poisson's ratio.
+middle and half a size, that is half of its width and height; h, R and nu are thickness, reference
+length and Poisson's ratio.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.quantities.quantity import format_number
-from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
+from magshell_fenicsx.quantities.registry import amplitude, field_columns, shown_quantity
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -23,8 +23,8 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 DIGIT_WIDTH, DIGIT_HEIGHT = 0.6, 0.95  # over the size of the font
 MARK_DISTANCE = 4.0  # between a mark and its number, in points
-# columns of captions, where they are not zero
-CAPTION_COLUMNS = ("lambda_m", "field_angle", "p_over_pc", "force", "load_factor", "time")
+# columns of captions beside the fields, where they are not zero
+CAPTION_COLUMNS = ("field_angle", "p_over_pc", "force", "load_factor", "time")
 # directions from a mark to its number, the preferred first
 TEXT_DIRECTIONS = [(-1, 1), (1, 1), (-1, -1), (1, -1), (0, 1.3), (0, -1.3), (-1.3, 0), (1.3, 0)]
 ROUNDING = 1e-9  # points: of distances that are compared
@@ -167,12 +167,13 @@ def _is_free(middle: Array, half: Array, occupied: Sequence[tuple[Array, Array]]
 
 
 def shell_caption(h: float, nu: float, row: Row) -> str:
-    """Return R/h, Poisson's ratio and the field at a row of path.csv, for a caption.
+    """Return R/h, Poisson's ratio and the fields at a row of path.csv, for a caption.
 
     `h` is the thickness over R, and `nu` Poisson's ratio.
     """
-    text = rf"$R/h$ = {1 / h:.6g}, $\nu$ = {nu:g}"
-    return text + (f", {named_value('lambda_m', row)}" if row["lambda_m"] else "")
+    texts = [rf"$R/h$ = {1 / h:.6g}", rf"$\nu$ = {nu:g}"]
+    texts += [named_value(column, row) for column in field_columns() if row[column]]
+    return ", ".join(texts)
 
 
 def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> str:
@@ -189,8 +190,9 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
 
     Examples
     --------
-    >>> row = {"lambda_m": 0.0, "field_angle": 0.0, "p_over_pc": 0.25, "amplitude": "pressure"}
-    >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, amplitudes=["pressure", "my_springs"])
+    >>> row = {"field_angle": 0.0, "p_over_pc": 0.25, "amplitude": "pressure", "my_springs": 0.02}
+    >>> row |= dict.fromkeys(field_columns(), 0.0)
+    >>> caption(0.01, 0.5, row, amplitudes=["pressure", "my_springs"])
     '$R/h$ = 100, $\\nu$ = 0.5, $p/p_\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
     # loads that are zero are left out
@@ -207,11 +209,12 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
     if row["amplitude"] == "time":
         items.append(named_value("time", row))
     # other amplitudes, such as those of user-defined energies
-    further_columns = (amplitude(name).column for name in amplitudes)
+    columns_of_amplitudes = (amplitude(name).column for name in amplitudes)
+    shown = (*field_columns(), *CAPTION_COLUMNS)
     items += [
         named_value(column, row)
-        for column in further_columns
-        if column not in CAPTION_COLUMNS and row.get(column)
+        for column in columns_of_amplitudes
+        if column not in shown and row.get(column)
     ]
     return ", ".join(items)
 

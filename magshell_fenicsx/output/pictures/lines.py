@@ -91,9 +91,9 @@ def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
 def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
     """Return the last rows of a path, in which an amplitude varied, after the row before them.
 
-    For the field's amplitude lambda_m they are all rows.
+    For the strength of a field they are all rows.
     """
-    if amplitude == "lambda_m":
+    if registered(amplitude).components:
         return rows
     # the last row at which another amplitude varied, or else the first row
     first_row = max(

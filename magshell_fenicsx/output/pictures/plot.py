@@ -48,6 +48,7 @@ from magshell_fenicsx.output.store.manifest import refuse_unwritten, write_manif
 from magshell_fenicsx.output.store.stored_results import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.parts.observables import MapGrid
+from magshell_fenicsx.quantities.registry import field_columns
 
 MAX_PANELS = 12  # of solutions.png
 MAPS = "field_maps"  # key of the case with the names of grids
@@ -326,15 +327,20 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
         yield from figure_files(figure, style, "solutions")
 
 
+def has_field(row: Row) -> bool:
+    """Return whether a field is applied at the point of a row."""
+    return any(row[column] for column in field_columns())
+
+
 def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
     """Return a surface without the applied field Ba, if that is zero at the point of `row`.
 
     The remanence Br is left out too where no row has a field.
     """
-    if row["lambda_m"]:
+    if has_field(row):
         return surface
     # a remanence is of interest as soon as a field is applied on the path
-    left_out = {"Ba"} if any(other_row["lambda_m"] for other_row in rows) else {"Ba", "Br"}
+    left_out = {"Ba"} if any(map(has_field, rows)) else {"Ba", "Br"}
     fields = {name: values for name, values in surface.fields.items() if name not in left_out}
     return replace(surface, fields=fields)
 

@@ -13,6 +13,7 @@ from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMN
 from magshell_fenicsx.output.pictures.lines import curve_steps
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.parts.magnetism.fields import FIELD
 from magshell_fenicsx.problem.requests import OutputSection
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import shown_quantity
@@ -90,7 +91,7 @@ def unit_of(case: Mapping[str, Any]) -> tuple[float, str]:
     --------
     >>> unit_of({"magnetic": {"remanent": {"flux_density": 0.08}}})
     (1000.0, '(mT)')
-    >>> unit_of({"magnetic": {"remanent": {"flux_density": None}, "lambda_m": 1e-4}})
+    >>> unit_of({"magnetic": {"remanent": {"flux_density": None}}})
     (1.0, '$B/|B^\\mathrm{r}|$')
     """
     # the sections of all remanences, of the case and of each of several shells
@@ -105,4 +106,4 @@ def unit_of(case: Mapping[str, Any]) -> tuple[float, str]:
         return MILLI, "(mT)"
     if remanences:
         return 1.0, r"$B/|B^\mathrm{r}|$"
-    return (MILLI, "(mT)") if magnetic.get("lambda_m") is None else (1.0, r"$B/\sqrt{\mu_0 E}$")
+    return (MILLI, "(mT)") if magnetic.get(FIELD.name) is None else (1.0, r"$B/\sqrt{\mu_0 E}$")

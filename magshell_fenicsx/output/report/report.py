@@ -37,6 +37,7 @@ from magshell_fenicsx.output.report.verdict import (
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.stored_results import headline, is_flat, pole_of, shell_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
+from magshell_fenicsx.parts.magnetism.fields import GROUPS as GROUPS_OF_FIELD
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 
@@ -196,15 +197,16 @@ def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
     """
     groups, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")  # a number, or a formula
-    # what lambda_m is made of: for soft material alone there is no remanence in it
+    strength, strength_over_thickness = (groups[name] for name in GROUPS_OF_FIELD)
+    # what the strength is made of: for soft material alone there is no remanence in it
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
     if chi is not None and "remanent" not in magnetic:
         field = "|B<sup>a</sup>|/√(μ<sub>0</sub>E)"
     values = {
         "R/h": groups["radius_to_thickness"],
         "ν": groups["poisson_ratio"],
-        f"λ<sub>m</sub> = {field}": groups["lambda_m"],
-        "Λ<sub>m</sub> = λ<sub>m</sub>R/h": groups["Lambda_m"],
+        f"λ<sub>m</sub> = {field}": strength,
+        "Λ<sub>m</sub> = λ<sub>m</sub>R/h": strength_over_thickness,
         **({"p<sub>c</sub>/E": groups["pc_over_E"]} if classical else {}),
     }
     if isinstance(chi, int | float):

@@ -457,8 +457,8 @@ def terminal_text(sentence: Markup) -> str:
 
     Examples
     --------
-    >>> terminal_text(Markup("λ<sub>m</sub> = −1.84 · 10<sup>−5</sup> (10<sup>2</sup> Pa) &lt; 1"))
-    'lambda_m = -1.84e-5 (1e2 Pa) < 1'
+    >>> terminal_text(Markup("ω<sub>1</sub> = −1.84 · 10<sup>−5</sup> (10<sup>2</sup> Pa) &lt; 1"))
+    'omega_1 = -1.84e-5 (1e2 Pa) < 1'
     """
     text = str(sentence).replace(" · 10<sup>", "e").replace("10<sup>", "1e").replace("−", "-")
     return plain_text(unescape(re.sub(r"</?su[bp]>", "", text.replace("<sub>", "_"))))
@@ -509,7 +509,7 @@ def _instability(
     displacement = _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
-    elif line["amplitude"] == "lambda_m":
+    elif "critical_field" in amplitude(line["amplitude"]).critical:
         sentence = "The field makes the shell unstable at the critical {}: a {}, {}."
     else:
         sentence = "The first instability on the path is at {}: a {}, {}."

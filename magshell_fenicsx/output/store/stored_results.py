@@ -18,12 +18,13 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import damage, read_object
 from magshell_fenicsx.output.store.run_identity import CHECKPOINT, SUMMARY, identity_in
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
+from magshell_fenicsx.parts.magnetism.fields import GROUPS as GROUPS_OF_FIELD
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.requests import OutputSection
 
 NUMBER_TYPES, NONE_TYPE = (int, float), type(None)
 PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
-GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
+GROUPS = ("radius_to_thickness", "poisson_ratio", *GROUPS_OF_FIELD, "pc_over_E")
 ALL_NUMBERS = {"*": NUMBER_TYPES}
 MAGNETIC_SECTIONS = {"remanent?": dict, "applied?": dict}
 # types of what is read from summary.json; a key with ? may be absent, * is every key, [...] a list

@@ -2,7 +2,7 @@
 
 - A programme is the list of a case's steps. Only steps of kind `rotation` turn the field.
 - An amplitude is a load parameter, by name; mu holds them all. The components of a field along its
-  `axes` are the amplitudes `FIELD`: along its first direction, and across it.
+  `axes` are the amplitudes `COMPONENTS`: along its first direction, and across it.
 - A curve is a function of one parameter t that returns an amplitude with its first and second
   derivatives; a step follows it.
 - A field in space (of sources or formulas) has one strength and turns as a whole, by an amplitude
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Curve
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
-from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES, Magnetisation
+from magshell_fenicsx.parts.magnetism.fields import FIELD
+from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.moving_source import combined_motion
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 Array = NDArray[np.float64]
-FIELD = ("lambda_m", *TRANSVERSE_AMPLITUDES)  # amplitudes of the field's components
+COMPONENTS = (FIELD.name, *FIELD.components)  # amplitudes of the field's components
 
 
 def directions(
@@ -43,7 +44,7 @@ def directions(
 
 
 def components(direction: Array, field: Magnetisation | None) -> Array:
-    """Return the components of a direction (3,), for the amplitudes of `FIELD` that exist.
+    """Return the components of a direction (3,), for the amplitudes of `COMPONENTS` that exist.
 
     A field in space has one amplitude for all directions: the result is then [1].
     """
@@ -52,13 +53,13 @@ def components(direction: Array, field: Magnetisation | None) -> Array:
 
 def field_at(mu: Mapping[str, float]) -> Array:
     """Return the components of the field that exist, from all amplitudes by name."""
-    return np.array([mu[name] for name in FIELD if name in mu])
+    return np.array([mu[name] for name in COMPONENTS if name in mu])
 
 
 def straight(direction: Array) -> dict[str, Curve]:
     """Return amplitude -> curve for a field of strength t along a direction.
 
-    `direction` has a component for each amplitude of `FIELD` that exists. A curve returns the
+    `direction` has a component for each amplitude of `COMPONENTS` that exists. A curve returns the
     amplitude c t with its derivatives c and 0.
     """
 
@@ -66,7 +67,7 @@ def straight(direction: Array) -> dict[str, Curve]:
         """Return the curve c t."""
         return lambda t: (c * t, c, 0.0)
 
-    return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
+    return {name: curve(float(c)) for name, c in zip(COMPONENTS, direction, strict=False)}
 
 
 def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
@@ -86,7 +87,7 @@ def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
             -b * cos(t) - a * sin(t),
         )
 
-    names_and_sizes = zip(FIELD, size * start, size * quarter_turn, strict=False)
+    names_and_sizes = zip(COMPONENTS, size * start, size * quarter_turn, strict=False)
     return {name: curve(float(b), float(a)) for name, b, a in names_and_sizes}
 
 
@@ -98,9 +99,9 @@ def as_a_whole(name: str, total: float) -> dict[str, Curve]:
 def field_size(mu: Mapping[str, float], sense: float) -> float:
     """Return the magnitude of the field from amplitudes `mu`, with the sign `sense` of the case.
 
-    A field that has not turned is returned as lambda_m, with its own sign.
+    A field that has not turned is returned with its own sign.
     """
-    first, second, third = (mu.get(name, 0.0) for name in FIELD)
+    first, second, third = (mu.get(name, 0.0) for name in COMPONENTS)
     return copysign(hypot(first, second, third), sense) if second or third else first
 
 
@@ -121,7 +122,7 @@ def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: flo
         sine = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
         return degrees(atan2(sine, float(first @ direction)))
     # else: components along the first direction, and across it
-    along, second, third = (mu.get(name, 0.0) for name in FIELD)
+    along, second, third = (mu.get(name, 0.0) for name in COMPONENTS)
     if not (second or third):
         return 0.0
     return degrees(atan2(hypot(second, third) if third else sense * second, sense * along))

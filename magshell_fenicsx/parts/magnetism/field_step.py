@@ -1,7 +1,7 @@
 """The applied magnetic field as a load: steps that change its strength or its direction.
 
-- lambda_m is the amplitude (load parameter) of the field along its first direction. A uniform field
-  that turns has further amplitudes, one for each direction normal to the first; mu holds all
+- The strength of the field along its first direction is an amplitude (load parameter). A uniform
+  field that turns has further amplitudes, one for each direction normal to the first; mu holds all
   amplitudes by name. Curves give the amplitudes as functions of one parameter.
 - A programme is a list of steps; a step's course says how it goes on from its begin.
 - A field in space (of sources, formulas or a gradient) has one strength and turns as a whole.
@@ -20,7 +20,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction, in_units
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.fields import ANGLE, FIELD, MagneticSection, strength
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import (
@@ -48,17 +48,17 @@ class FieldSection(FactorStep):
     direction. By default the path is followed by arc length, through folds of lambda_m.
     """
 
-    amplitude: ClassVar[str] = "lambda_m"
+    amplitude: ClassVar[str] = FIELD.name
     section: ClassVar[str] = "magnetic"
     label: ClassVar[Literal["", "field"]] = "field"
     rank_before_load: ClassVar[int] = 4
-    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "lambda_m")}
+    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", FIELD.column)}
     kind: Literal["field"]
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target over the field of `magnetic`; 1 by default, 0 switches the field off"""
 
     def scale(self, load_start: LoadStart) -> float:
-        """Return lambda_m of the case: it counts as of order one in the arc length."""
+        """Return the strength of the case: it counts as of order one in the arc length."""
         return load_start.size
 
     @classmethod
@@ -113,7 +113,7 @@ class FieldSection(FactorStep):
         """Return the field's direction at the begin of the step, and its strength there.
 
         The direction is an array of components, one for each amplitude of the field that exists:
-        lambda_m, then those across its first direction. A field in space has the component 1.
+        along its first direction, then those across it. A field in space has the component 1.
         """
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
@@ -122,6 +122,11 @@ class FieldSection(FactorStep):
         present_direction = all_directions[step_start.step.number - 1]  # steps count from 1
         direction = components(present_direction, field)
         return direction, float(direction @ field_at(step_start.mu))
+
+    @classmethod
+    def strength(cls, context: Context) -> float | None:
+        """Return the strength of the case's field, which may be 0; None without its section."""
+        return strength(context) if context.section_of(MagneticSection) else None
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
@@ -154,7 +159,7 @@ class RotationSection(Step):
 
     amplitude: ClassVar[str] = ANGLE
     holdable: ClassVar[bool] = False
-    alters: ClassVar[tuple[str, ...]] = ("lambda_m", "lambda_across", "lambda_third")
+    alters: ClassVar[tuple[str, ...]] = (FIELD.name, *FIELD.components)
     kind: Literal["rotation"]
     to: Direction
     """Its last direction"""

@@ -33,6 +33,7 @@ from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_ave
 from magshell_fenicsx.parts.revolution_sections import SurfaceSection
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.quantities.quantity import CaseSizes
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
@@ -48,7 +49,10 @@ MIN_LAMBDA, MAX_LAMBDA = (
     1e-12,
     10.0,
 )  # of lambda_m: rounding, and a thousand times what destabilises a shell
+FIELD = amplitude("lambda_m")  # the field's strength along its first direction
 ANGLE = "angle"  # amplitude of a step that turns the field
+# names of the dimensionless groups of a field -> their words: its strength, and that over h/R
+GROUPS = {"lambda_m": "lambda_m", "Lambda_m": "Lambda_m = lambda_m R/h"}
 
 
 class AppliedSection(Direction):
@@ -334,6 +338,27 @@ class MagneticSection(Section, Ability):
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         return self.applied.reference / self.tesla(youngs_modulus)
 
+    def apart_from_strength(self) -> dict[str, Any]:
+        """Return the section as plain data, without keys that change the field's strength alone."""
+        data = self.model_dump(mode="json")
+        del data["lambda_m"]
+        # beside a remanence, the ratio to it counts of a susceptibility: its flux density stays
+        if self.remanent and self.susceptibility is None:
+            del data["remanent"]["flux_density"]
+        # beside sources, the applied flux density is that of a further field, and stays
+        if not self.applied.sources:
+            del data["applied"]["flux_density"]
+        return data
+
+    @staticmethod
+    def with_strength(value: float) -> dict[str, float | None]:
+        """Return keys of a case -> values that give its field a strength.
+
+        None stands for a flux density that is not given, as the strength replaces it.
+        """
+        flux_densities = ("magnetic.remanent.flux_density", "magnetic.applied.flux_density")
+        return {f"magnetic.{FIELD.name}": value, **dict.fromkeys(flux_densities)}
+
     def tesla(self, youngs_modulus: float) -> float:
         """Return the applied flux density (T) of lambda_m = 1; the modulus is in Pa."""
         if self.remanent is None:
@@ -408,18 +433,16 @@ class MagneticSection(Section, Ability):
         The list is empty if no field acts on the shell, nothing magnetic is read, and parts do not
         act on each other. Parts that do exclude an axisymmetric model.
         """
+        from magshell_fenicsx.parts.magnetism.interaction import has_effect
         from magshell_fenicsx.parts.magnetism.magnetisation import (
             remanence_constraints,
         )  # the solver takes long to import
-        from magshell_fenicsx.parts.magnetism.sensors import is_read
 
         # this constraint has only a reason why the problem is not axisymmetric
         interacting = (
             [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         )
-        # whether the magnetisation matters: a field acts on it, it is read, or parts interact
-        is_driven_or_read = strength(context) or is_read(context)
-        is_visible = is_driven_or_read or interacting
+        is_visible = has_effect(context)
         return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
@@ -587,6 +610,12 @@ def strength(context: Context) -> float:
     """Return lambda_m of a case; 0 without a field."""
     magnetic = context.section_of(MagneticSection)
     return magnetic.amplitude(context.shell.youngs_modulus) if magnetic else 0.0
+
+
+def dimensionless_groups(context: Context, R_over_h: float) -> dict[str, float]:
+    """Return name -> value of the groups of `GROUPS`; they are 0 without a field."""
+    value = strength(context)
+    return dict(zip(GROUPS, (value, value * R_over_h), strict=True))
 
 
 def _refuse_unfit_sources(context: Context, places: Array) -> None:

@@ -13,7 +13,8 @@ from pydantic import Field
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.sensors import is_read
 from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.shell_sections import MeshSurface
@@ -91,6 +92,11 @@ def acts(context: Context) -> bool:
     """Return whether magnetised parts act on each other."""
     magnetic = context.section_of(MagneticSection)
     return magnetic is not None and magnetic.interaction != "none"
+
+
+def has_effect(context: Context) -> bool:
+    """Return whether a field acts on the shell, something magnetic is read, or parts interact."""
+    return bool(strength(context)) or is_read(context) or acts(context)
 
 
 def interaction(context: Context) -> Interaction | None:

@@ -1,6 +1,6 @@
 """The magnetisation of a model, and the applied field, in the model's frame.
 
-- lambda_m is the amplitude (load parameter) of the applied field. A uniform field that turns has
+- The strength of the applied field is an amplitude (load parameter). A uniform field that turns has
   further amplitudes for directions across its first one; mu holds all amplitudes by name.
 - A pattern is a function of undeformed places and normals that gives vectors. A field in space is a
   function of the deformed place that gives flux density and derivatives. Places are over R.
@@ -10,7 +10,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from dolfinx import fem
@@ -20,13 +20,33 @@ from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.spatial_fields import Pattern, by_patch
+from magshell_fenicsx.parts.magnetism.fields import FIELD
 from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 
-TRANSVERSE_AMPLITUDES = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 RemanenceLaw = Literal["deformation", "rotation"]
 PLACES = 50  # on each rank, where a field and its images are compared
+# amplitudes of a field's uniform parts -> what the names of their energies end in
+SUFFIXES = dict(zip((FIELD.name, *FIELD.components), ("", " across", " third"), strict=True))
+
+
+class UniformPart(NamedTuple):
+    """A uniform part of the applied field.
+
+    Attributes
+    ----------
+    amplitude
+        Name of its amplitude.
+    suffix
+        What the names of its energies end in.
+    vector
+        (3,) the part at an amplitude of one.
+    """
+
+    amplitude: str
+    suffix: str
+    vector: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -45,8 +65,8 @@ class Magnetisation:
     driven
         Fields that amplitudes drive, added to `in_space`.
     across
-        Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the
-        amplitudes of `TRANSVERSE_AMPLITUDES`.
+        Vectors (3,), normal to `applied` and to each other, that the field turns towards, with
+        amplitudes of their own.
     axes
         Unit vectors along `applied` and `across`.
     turns
@@ -69,8 +89,8 @@ class Magnetisation:
     metres
         R in m; 0 if the case has no lengths with units, or no flux densities.
     absent
-        Whether the case says that nothing is magnetised, though it has a direction: lambda_m is 0,
-        and nothing reads.
+        Whether the case says that nothing is magnetised, though it has a direction: the strength of
+        the field is 0, and nothing reads.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -96,14 +116,28 @@ class Magnetisation:
         """Whether the applied flux density is uniform."""
         return self.gradient is None and self.in_space is None
 
+    @property
+    def uniform_parts(self) -> list[UniformPart]:
+        """The uniform parts of the field, along its first direction and across it."""
+        vectors = (self.applied, *self.across)
+        return [
+            UniformPart(amplitude, suffix, vector)
+            for (amplitude, suffix), vector in zip(SUFFIXES.items(), vectors, strict=False)
+        ]
+
+    @property
+    def amplitudes(self) -> tuple[str, ...]:
+        """Names of the amplitudes of the field: of its uniform parts, and of its rotations."""
+        parts = (part.amplitude for part in self.uniform_parts)
+        return (*parts, *(motion.name for motion in self.turns))
+
     def field_at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the applied flux density (..., 3) at deformed places r (..., 3) over R.
 
-        It is in the unit of lambda_m: a uniform field has the magnitude lambda_m. `mu` are all
-        amplitudes by name.
+        A uniform field has the magnitude of its strength. `mu` are all amplitudes by name.
         """
-        lambda_m = mu.get("lambda_m", 0.0)
-        if self.in_space and not lambda_m:  # lambda_m multiplies all of it
+        strength = mu.get(FIELD.name, 0.0)
+        if self.in_space and not strength:  # it multiplies all of the field
             return np.zeros_like(r)
         # a field in space, with what is driven: the first entries are B, without derivatives
         if self.in_space:
@@ -112,14 +146,14 @@ class Magnetisation:
             B = B_at_rest + sum(
                 (field.field_at(x, mu).value[0] for field in self.driven), np.zeros(3)
             )
-            return np.asarray(lambda_m * B.reshape(r.shape))
+            return np.asarray(strength * B.reshape(r.shape))
         # a uniform field by its components, and perhaps a gradient
-        uniform = lambda_m * self.applied
-        for name, component in zip(TRANSVERSE_AMPLITUDES, self.across, strict=False):
+        uniform = strength * self.applied
+        for name, component in zip(FIELD.components, self.across, strict=False):
             uniform = uniform + mu.get(name, 0.0) * component
         if self.gradient is None:
             return np.broadcast_to(uniform, r.shape)
-        return np.asarray(uniform + lambda_m * r @ self.gradient.T)
+        return np.asarray(uniform + strength * r @ self.gradient.T)
 
     def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
         """Return 1 if the field's mirror images continue it, -1 if their opposites do; collective.

@@ -13,6 +13,7 @@ or, of a shell that is soft alone, over √(μ0 E).
 """
 
 from collections.abc import Sequence
+from math import copysign
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.ability import Account, Context
-from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection, strength
+from magshell_fenicsx.parts.magnetism.fields import FIELD, MU_0, MagneticSection, strength
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
 from magshell_fenicsx.parts.observables import ModelView, Observables, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -55,7 +56,7 @@ class FieldObservables(Observables):
     """
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return no columns: `lambda_m` and `field_angle` are columns of every run."""
+        """Return no columns: strength and angle of the field are columns of every run."""
         return ()
 
     def account(self, context: Context, loads: "Loads") -> Account:
@@ -95,8 +96,9 @@ class FieldObservables(Observables):
             field_size,
         )
 
-        angle = field_angle(state.mu, view.loads.magnetic, view.sense)
-        return {"lambda_m": field_size(state.mu, view.sense), "field_angle": angle}
+        sense = copysign(1.0, view.strengths.get(FIELD.name, 1.0))
+        angle = field_angle(state.mu, view.loads.magnetic, sense)
+        return {FIELD.column: field_size(state.mu, sense), "field_angle": angle}
 
 
 def moment_in_summary(view: ModelView, state: "State") -> dict[str, Any]:
@@ -266,7 +268,6 @@ def _derivatives_by_field(
     reading does not depend on the applied field.
     """
     from magshell_fenicsx.continuation.system import State
-    from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
     from magshell_fenicsx.parts.magnetism.self_field import DIFFERENCE_STEP, DIFFERENCE_WEIGHTS
 
     applied = view.loads.magnetic
@@ -275,7 +276,7 @@ def _derivatives_by_field(
     if not sensor.total and not applied.soft:
         return {}
     names_of_motions = (name for moving_field in applied.driven for name in moving_field.names)
-    names = {"lambda_m", *TRANSVERSE_AMPLITUDES, *names_of_motions}
+    names = {FIELD.name, *FIELD.components, *names_of_motions}
     by_mu = dict[str, float]()
     for name in sorted(names & state.mu.keys()):
         value = state.mu[name]
@@ -321,7 +322,7 @@ def field_at(
         (n, 3) over R, in the frame of the model.
     own_factor, applied_factor
         Units of the shell's own field and of the applied one: what a remanence of length one, and
-        lambda_m = 1, count for. Numbers, or (n, 1) for each place.
+        an applied field of strength one, count for. Numbers, or (n, 1) for each place.
     """
     from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 

@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.magnetism.charges import (
     moment,
     triangles,
 )
-from magshell_fenicsx.parts.magnetism.fields import MU_0
+from magshell_fenicsx.parts.magnetism.fields import FIELD, MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, NodalDerivatives
 from magshell_fenicsx.parts.observables import ModelView
@@ -473,7 +473,7 @@ class SelfField:
         magnetic, mirror = self._sight.loads.magnetic, self._sight.mirror
         if magnetic and mirror:
             # a field of amplitude zero has no sign; an amplitude of one has the same symmetry
-            amplitudes = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
+            amplitudes = {**mu, FIELD.name: mu.get(FIELD.name, 0.0) or 1.0}
             return magnetic.sign_of_images(amplitudes, self._sight.model.r0, mirror)
         return sign
 

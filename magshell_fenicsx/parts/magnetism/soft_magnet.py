@@ -18,7 +18,6 @@ quadrature point takes its place. An amplitude is a factor of a uniform part of 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -123,16 +122,10 @@ class Sheet:
 
     field: "Magnetisation"
 
-    @cached_property
+    @property
     def amplitudes(self) -> tuple[str, ...]:
-        """Names of the amplitudes of the field's uniform parts, lambda_m first."""
-        # imported late: that module imports this one
-        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
-
-        return (
-            "lambda_m",
-            *(() if self.field.in_space else TRANSVERSE_AMPLITUDES[: len(self.field.across)]),
-        )
+        """Names of the amplitudes of the field's uniform parts, along its first direction first."""
+        return tuple(part.amplitude for part in self.field.uniform_parts)
 
     @property
     def vectors(self) -> list[Array]:

@@ -26,6 +26,8 @@ from magshell_fenicsx.parts.motion.history import (
 )
 from magshell_fenicsx.parts.step import BALANCE, Step
 from magshell_fenicsx.parts.step_course import Errors, ExpectedEnd, StepEnd
+from magshell_fenicsx.quantities.quantity import Amplitude
+from magshell_fenicsx.quantities.registry import AMPLITUDES, amplitude
 from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding
 
@@ -143,7 +145,8 @@ class TimeSection(Step):
     @property
     def drives(self) -> tuple[str, ...]:
         """The amplitudes that follow histories."""
-        return tuple("lambda_m" if name == "field" else name for name in self.history)
+        amplitudes = _amplitudes_of_histories()
+        return tuple(amplitudes[name].name if name in amplitudes else name for name in self.history)
 
     def expected_end(self, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
         """Return the end of the step in words, after its number of rows."""
@@ -167,16 +170,20 @@ class TimeSection(Step):
         ValueError
             With the key and what is allowed.
         """
+        from magshell_fenicsx.parts.registered import section_of_strength  # it has this step too
+
         key = context.step.key
-        if "field" in self.history:
-            # the field has its direction, and a size
-            refusal = ""
-            if "angle" in context.driven_before(context.step.number):
-                refusal = "not after kind: rotation"
-            if "lambda_m" not in _factors_of_sections(context):
-                refusal = "needs magnetic.lambda_m, not zero"
-            if refusal:
-                raise ValueError(f"{key}.history.field: {refusal}")
+        driven_before = context.driven_before(context.step.number)
+        turned_before = {amplitude(name).turned for name in driven_before}
+        for name, field in _amplitudes_of_histories().items():
+            if name not in self.history:
+                continue
+            # a field has its first direction, and a strength
+            if not context.strengths.get(field.name):
+                section = section_of_strength(field.name)
+                raise ValueError(f"{key}.history.{name}: needs {section}.{field.name}, not zero")
+            if field.name in turned_before:
+                raise ValueError(f"{key}.history.{name}: not after kind: rotation")
         # times with units need a case that has units
         for time_key, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
@@ -196,11 +203,13 @@ class TimeSection(Step):
         ValueError
             With the key and what is allowed.
         """
-        # loads that may have a history: of steps, and of sections without a step. The amplitude of
-        # the field is named `field` here; the angle and the time follow from steps of their own
+        # loads that may have a history: of steps, and of sections without a step. Fields have
+        # another name here than their amplitude; angle and time follow from steps of their own
         loads = {case_step.name: case_step.load for case_step in context.steps}
         section_amplitudes = _factors_of_sections(context)
-        allowed = {"field", "pressure", *section_amplitudes, *loads} - {"lambda_m", "angle", "time"}
+        fields = _amplitudes_of_histories()
+        allowed = {*fields, "pressure", *section_amplitudes, *loads}
+        allowed -= {*(field.name for field in fields.values()), "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
                 raise ValueError(
@@ -254,19 +263,19 @@ class TimeSection(Step):
         )
 
 
+def _amplitudes_of_histories() -> dict[str, Amplitude]:
+    """Return name in histories -> amplitude, of fields, whose amplitude has another name."""
+    return {a.history: a for a in AMPLITUDES.values() if a.history}
+
+
 def _factors_of_sections(context: Context) -> set[str]:
     """Return amplitudes that sections of the case ask for, such as "interaction".
 
     They grow to a factor without a step of the programme.
     """
-    from magshell_fenicsx.parts.path_step import FactorStep
-    from magshell_fenicsx.parts.registered import STEPS  # which has this step too
+    from magshell_fenicsx.parts.registered import FACTORS  # which has this step too
 
-    return {
-        step_kind.amplitude
-        for step_kind in STEPS.values()
-        if issubclass(step_kind, FactorStep) and step_kind.asked_for(context)
-    }
+    return {step_class.amplitude for step_class in FACTORS if step_class.asked_for(context)}
 
 
 def level_in(context: Context, name: str, level: Level) -> float:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.control import ConstraintRow, PrescribedConjugate, PrescribedLoad
 from magshell_fenicsx.continuation.fold import FoldGuess, FoldLost, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.contact_control import with_cuts_here, with_own_contact
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -44,7 +45,6 @@ MAX_DISTANCE_IN_CELLS = (
     0.1  # largest distance, in cells; two meshes approximate a curved edge differently
 )
 NEAR_CELL_DISTANCE = 1.0  # distance, in cells, beyond which a cell's map is not inverted
-FIELDS = ("lambda_m", "angle")  # amplitudes whose value is prescribed
 MOST_CHANGED = 10  # times that an end gets stiffer penalties or new cuts of shells that touch
 
 
@@ -593,12 +593,11 @@ def at_target(scene: Scene, record: Record) -> Ending:
     load = scene.problem.programme[record.step - 1].load
     target = load.end.target  # a pair: what it prescribes, and the value
     # a field that turns by an angle does its work through the component across
-    name = "lambda_across" if record.amplitude == "angle" else record.amplitude
+    varied = amplitude(record.amplitude)
+    name = amplitude(varied.turned).components[0] if varied.turned else varied.name
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held_value = (
-        -system.potential(state.u, state.mu, name)
-        if by_conjugate and record.amplitude not in FIELDS
-        else None
+        -system.potential(state.u, state.mu, name) if by_conjugate and not varied.is_field else None
     )
     kind: Literal["target", "held"] = (
         "held" if any(law != "load" for law in load.hold.values()) else "target"

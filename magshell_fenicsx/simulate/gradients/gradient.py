@@ -364,7 +364,7 @@ def derivative(adjoint: Adjoint, by: str, scenes: SceneCache | None = None) -> G
     Parameters
     ----------
     by
-        Amplitude, as "lambda_m"; key of a number in the case; or field: "remanence", "magnitude",
+        Amplitude, as "force"; key of a number in the case; or field: "remanence", "magnitude",
         "thickness", "curvature" or "deviation".
     scenes
         Scenes on the mesh of the adjoint's scene, for further results; None: new ones.

@@ -2,8 +2,8 @@
 
 In: the records of a path. Out: adjoints, from which derivatives by any parameter follow. The result
 is the load at a fold, or at a bifurcation into waves around a meridian. An amplitude is a load
-parameter by name, as "pressure" or "lambda_m", the strength of the magnetic field. A path may go
-over to a branch at a bifurcation; the records of this branch do not count.
+parameter by name, as "pressure". A path may go over to a branch at a bifurcation; the records of
+this branch do not count.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,10 @@ from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import leaves_path
 
-# result -> the amplitude of its fold
-FOLDS = {
-    "knockdown": "pressure",
-    "buckling_pressure_Pa": "pressure",
-    "critical_field": "lambda_m",
-    "critical_field_mT": "lambda_m",
-}
-SCALES = {"buckling_pressure_Pa": "p_c", "critical_field_mT": "λ_m"}  # of those in units
+_LOADS = [a for a in quantities.AMPLITUDES.values() if a.critical]
+# result -> the amplitude of its fold; and of those in units -> key of the unit
+FOLDS = {name: load.name for load in _LOADS for name in load.critical}
+SCALES = {load.critical[1]: quantities.quantity(load.column).scale for load in _LOADS}
 MAX_LOAD_RATIO = 1.15  # instabilities up to this multiple of the lowest are looked at
 MAX_INSTABILITIES = 5  # and at most so many
 

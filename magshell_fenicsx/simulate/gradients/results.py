@@ -24,7 +24,6 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.loads import forces
-from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -300,10 +299,7 @@ class NamesOnlyScene(Scene):
         """Return all amplitudes with value zero, and a displacement without unknowns."""
         loads = self.problem.loads
         field = loads.magnetic
-        components = TRANSVERSE_AMPLITUDES[: len(field.across)] if field else ()
-        field_amplitudes = (
-            ("lambda_m", *components, *(motion.name for motion in field.turns)) if field else ()
-        )
+        field_amplitudes = field.amplitudes if field else ()
         names = [
             *(["pressure"] if loads.pressure else []),
             *field_amplitudes,

@@ -213,7 +213,7 @@ def _refuse_incomparable(file: Path, settings: Sequence[str], make_case: MakeCas
         case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     # the programme of loads is the same for both models
     load_name = case.programme[-1].name if case.programme else ""
-    is_field_alone = load_name == "lambda_m" and case.loading is None
+    is_field_alone = amplitude(load_name).is_field and case.loading is None
     if is_field_alone or load_name in ("", *UNCOMPARED):
         raise CaseError(
             "compare: needs a load whose curve can be compared: pressure, indentation or field"

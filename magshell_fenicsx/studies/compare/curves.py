@@ -2,8 +2,7 @@
 
 A curve is the load over the displacement w/h in the last part of the path, in which the last
 amplitude (load parameter) varies. Loads are compared at places, displacements that both models
-reach. h and R are thickness and reference length, nu Poisson's ratio, lambda_m the size of the
-magnetic load.
+reach. h and R are thickness and reference length.
 """
 
 from collections.abc import Sequence
@@ -59,8 +58,9 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     In the last part the last amplitude varies. The column `W` has the displacement since the row
     before.
 
-    The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also
-    stretches the thickness. The displacement since the end of the field excludes this.
+    The field displaces the mid-surface of a solid more, by its strength times Poisson's ratio and
+    R, since it also stretches the thickness. The displacement since the end of the field excludes
+    this.
     """
     load_name = amplitude_of(run)
     # the same point in both models: of a force where it acts

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.picture import edge_lines
 from magshell_fenicsx.output.pictures.scales import number_format
-from magshell_fenicsx.quantities.registry import endings, quantity
+from magshell_fenicsx.quantities.registry import amplitude, endings, quantity
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS
 from magshell_fenicsx.studies.design.blocks import ControlPointField
 from magshell_fenicsx.studies.design.variables import Variables
 from magshell_fenicsx.studies.figures import add_legend, lengths_along_line, saved_figure
@@ -297,7 +298,7 @@ def _unit(result: str) -> str:
         return result_and_unit[1]
     # dimensionless results: what they are scaled with stands for a unit
     own_units = {
-        "critical_field": quantity("lambda_m").scale,
+        "critical_field": quantity(amplitude(FOLDS["critical_field"]).column).scale,
         "barrier": quantity("energy").scale,
         "shape": "shape",
     }

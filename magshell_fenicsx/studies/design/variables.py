@@ -6,7 +6,7 @@ mean, weighted by distance over the filter width. The fields are the remanence (
 the thickness over h, the natural curvatures 11 and 22 over 1/R, and the deviation w0 of the shape
 over h. On a meridian, where a field turns with the azimuth, points are (rho, z). A scene is the
 model of a case with its solver. Places are over R. `case.several` has the shells of a case of
-several ones; it is None for a single shell. lambda_m is the size of the magnetic load.
+several ones; it is None for a single shell.
 """
 
 import copy
@@ -25,6 +25,7 @@ from magshell_fenicsx.input.tables import read_vectors, write_vectors
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.control_points import ControlPoints
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.magnetism.interaction import acts
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
 from magshell_fenicsx.parts.shell_outline import outline
 from magshell_fenicsx.problem.formulas import THICKNESS
@@ -413,10 +414,8 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
 
 def _has_influence(case: Case) -> bool:
     """Return whether the remanence of a case has an influence on any result."""
-    if case.lambda_m or case.sensors:
-        return True
     # another magnet feels the remanence without an applied field, as a sensor does
-    return case.magnetic is not None and case.magnetic.interaction != "none"
+    return any(case.context.strengths.values()) or bool(case.sensors) or acts(case.context)
 
 
 def controls_of(

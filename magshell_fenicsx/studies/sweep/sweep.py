@@ -24,7 +24,7 @@ from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import COLUMNS, write_csv
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.quantities.registry import endings
+from magshell_fenicsx.quantities.registry import endings, field_columns
 from magshell_fenicsx.studies.outcome import Outcome
 from magshell_fenicsx.studies.points import (
     MOST_POINTS,
@@ -59,7 +59,7 @@ CURVE = (
         "label",
         "amplitude",
         "p_over_pc",
-        "lambda_m",
+        *field_columns(),
         "field_angle",
         "force",
         "load_factor",
