@@ -29,6 +29,7 @@ from magshell_fenicsx.parts.imperfections.modes import (
 )
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC, waves_of_label
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.shells.revolution import nodal_normals
 from magshell_fenicsx.simulate.follow import follow
@@ -133,7 +134,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
     node_count = len(places)
-    sign_of_image = -1.0 if mode.label == "antisymmetric" else 1.0
+    sign_of_image = -1.0 if mode.label == ANTISYMMETRIC else 1.0
     if mirror:  # images follow the nodes, in the same order
         places = np.vstack([places, mirror.image(places)])
         inward_displacements = np.concatenate(
@@ -147,7 +148,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             return on_meridian(
                 places[nodes],
                 inward_displacements[nodes],
-                int(mode.label.removeprefix("m = ") or 0),  # number of waves
+                waves_of_label(mode.label) or 0,
             )
         if not mirror:
             return on_surface(places[nodes], inward_displacements[nodes], places[nodes])

@@ -28,6 +28,7 @@ from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
+from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator, Surroundings
 from magshell_fenicsx.input.section import in_units
@@ -449,9 +450,9 @@ def _excluded_pivots(scene: Scene, state: State) -> int:
 
     It is 0 for a shell that moves freely, whose rigid motions would count.
     """
-    # the modes that the model excludes by its symmetry, in families; None if there are none
-    symmetry_breaking_modes = None if scene.free_in_time else scene.model.symmetry_breaking_modes
-    return sum(symmetry_breaking_modes.counts(state)) if symmetry_breaking_modes else 0
+    if scene.free_in_time:
+        return 0
+    return unstable_count(scene.model.symmetry_breaking_modes, state)
 
 
 def _event_function(

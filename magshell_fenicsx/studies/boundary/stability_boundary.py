@@ -43,13 +43,14 @@ from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC, wave_label
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow_alone
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.perturbation import KEYS_OUTSIDE_THE_MODEL
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_family import WAVES, SceneFamily, first_instability
+from magshell_fenicsx.simulate.scene_family import SceneFamily, first_instability
 from magshell_fenicsx.studies.boundary.journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary.picture import draw_boundary
 from magshell_fenicsx.studies.boundary.start import Start, start_from
@@ -232,7 +233,7 @@ def boundary(
         )
         name_of_mode = begin["mode"]
         # a half cannot follow a mode that it excludes; to the whole shell the mode is its own
-        if name_of_mode == "antisymmetric":
+        if name_of_mode == ANTISYMMETRIC:
             say_on_first_rank("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             # the points of the whole shell's history have other numbers
@@ -594,7 +595,7 @@ def _row(
         "key": float(locus.p),
         **_load(family.name, locus.state.mu[family.name], family.problem(locus.p)),
         "kind": label if label in SPECIAL else mode.kind,
-        "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in wave_numbers),
+        "mode": ", ".join(wave_label(m) if m else mode_name for m in wave_numbers),
         "error": float(locus.load_error),
         "unstable": int(unstable),
         "factorisations": int(locus.factorisations),
