@@ -36,7 +36,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection
 from magshell_fenicsx.parts.step_course import SnapSection
-from magshell_fenicsx.shape.meridian_chart import vector_function
+from magshell_fenicsx.shape.field_symmetry import formula_field
 from magshell_fenicsx.shells.mass import SupportInertia, mass, mass_with_supports
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.viscous import Branch, Viscosity
@@ -589,7 +589,7 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     unit, axes = scene.problem.time_unit or 1.0, model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
     # the formulas take places in the case's frame and units, and give velocities in these
-    velocity = vector_function(components)(R * places @ Q) @ Q.T * unit / R
+    velocity = formula_field(components)(R * places @ Q) @ Q.T * unit / R
     owned = np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
     return np.asarray(model.system.zero_at_supports(owned))
 
