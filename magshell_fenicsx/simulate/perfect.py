@@ -21,7 +21,6 @@ from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import (
     MirroredMode,
     Mode,
-    OfShells,
     Shape,
     on_meridian,
     on_surface,
@@ -119,8 +118,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
     """Return a mode as a function of the place, with largest value 1; collective.
 
     The function interpolates inward displacements at nodes. Of a half the other half's nodes, which
-    are mirror images, count too. With several shells there is one function for each shell that the
-    mode moves.
+    are mirror images, count too. There is one function for each shell that the mode moves.
     """
     model, mirror = scene.model, None
     # nodes with their displacements, and for each shell a mask of its nodes
@@ -159,17 +157,12 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         # from the model's frame to that of the case
         return in_frame(MirroredMode(function, mirror, sign_of_image), -scene.problem.azimuth)
 
-    nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
-    if len(nodes_of_shell) < 2:
-        return shape_of_shell(nodes_of_shell[0])
-    names = scene.problem.context.sections["shells"]
-    return OfShells(
-        {
-            name: shape_of_shell(nodes)
-            for name, nodes in zip(names, nodes_of_shell, strict=True)
-            if np.abs(inward_displacements[nodes]).max() > MIN_DISPLACEMENT
-        }
-    )
+    names = scene.problem.context.sections.get("shells") or [""]
+    return {
+        name: shape_of_shell(nodes)
+        for name, nodes in zip(names, map(np.flatnonzero, is_of_shell), strict=True)
+        if np.abs(inward_displacements[nodes]).max() > MIN_DISPLACEMENT
+    }
 
 
 def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:
