@@ -34,7 +34,13 @@ from magshell_fenicsx.case.loading import (
     refuse_unknown_patches,
 )
 from magshell_fenicsx.case.multi_shell_case import merge_shells, without_merged_keys
-from magshell_fenicsx.case.shells import MemberCase, SeveralShells, Shells, in_words_of_shells
+from magshell_fenicsx.case.shells import (
+    MemberCase,
+    OneOfShells,
+    SeveralShells,
+    Shells,
+    in_words_of_shells,
+)
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import (
     NOTED,
@@ -164,6 +170,16 @@ class Case(WithParts):
     def several(self) -> SeveralShells | None:
         """Shells of a case that has several; None of one shell."""
         return self._several
+
+    @property
+    def members(self) -> Sequence[MemberCase]:
+        """The shells of the case, each with a case of its own; of one shell this case itself."""
+        if self.several:
+            return self.several.parts
+        section = OneOfShells.model_construct(
+            shell=self.shell, boundary=self.boundary, points=self.points
+        )
+        return [MemberCase("", section, self)]
 
     def with_shells(self, parts: Sequence[MemberCase]) -> Self:
         """Return a copy of a case of several shells, whose imperfections have changed.

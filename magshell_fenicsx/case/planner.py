@@ -31,6 +31,7 @@ from magshell_fenicsx.case.modelled_part import (
     modelled_part,
     symmetry_constraints,
 )
+from magshell_fenicsx.case.shells import MemberCase
 from magshell_fenicsx.case.vertices import Vertices, chart_of, named_points, on_features
 from magshell_fenicsx.input.expressions import formula, formula_group
 from magshell_fenicsx.input.source import CaseError
@@ -315,14 +316,11 @@ def _pending_modes(case: Case) -> PendingModes | None:
     modes, the other takes the modes and makes the problem of the case. None if no imperfection
     waits for modes.
     """
-    several = case.several
-    member_shells = list(several.parts) if several else []
-    shell_cases = [member.case for member in member_shells] or [case]
-    # (number of the shell, key of the imperfection, its section)
+    # (shell, key of the imperfection, its section)
     pending_sections = [
-        (i, key, section)
-        for i, shell_case in enumerate(shell_cases)
-        for key, section in shell_case.imperfections.items()
+        (member, key, section)
+        for member in case.members
+        for key, section in member.case.imperfections.items()
         if isinstance(section, ModesSection) and section.pending_modes
     ]
     # zero without such sections, or if none of them asks for a mode
@@ -339,7 +337,7 @@ def _pending_modes(case: Case) -> PendingModes | None:
 
 def _problem_with_modes(
     case: Case,
-    pending_sections: Sequence[tuple[int, str, ModesSection]],
+    pending_sections: Sequence[tuple[MemberCase, str, ModesSection]],
     modes: tuple[Mode, ...],
 ) -> Problem:
     """Put the modes into the imperfection sections of a case, and return the problem with them.
@@ -347,7 +345,7 @@ def _problem_with_modes(
     Parameters
     ----------
     pending_sections
-        Number of the shell, key of the imperfection, and its section, which waits for modes.
+        Shell, key of the imperfection, and its section, which waits for modes.
     modes
         Buckling modes of the perfect shell, or of all perfect shells together.
 
@@ -357,14 +355,11 @@ def _problem_with_modes(
         If no mode with an amplitude moves one of several shells.
     """
     several = case.several
-    member_shells = list(several.parts) if several else []
-    for i, key, section in pending_sections:
-        # one of several shells takes its own part of the modes, by its name and its place
-        name_and_place = (member_shells[i].name, several.place(member_shells[i])) if several else ()
+    for member, key, section in pending_sections:
         try:
-            section.become(modes, *name_and_place)
+            section.become(modes, member.name, several.place(member) if several else None)
         except ValueError as e:
-            raise CaseError(member_shells[i].refused(f"shell.{key}.{e}")) from None
+            raise CaseError(member.refused(f"shell.{key}.{e}")) from None
     problem = make_problem(case.with_shells(several.parts) if several else case)
 
     def remade(values: Mapping[str, Any]) -> Problem:
@@ -912,7 +907,7 @@ def _warnings(case: Case, places: Array) -> tuple[str, ...]:
     contributors = case.context.contributors()
     warnings = [contributor.warning(context, places) for contributor, context in contributors]
     warnings.append(_unit_warning(case, places))
-    for member in case.several.parts if case.several else ():
+    for member in case.members:
         own_context = replace(member.case.context, steps=case.context.steps)
         warning = inflation_warning(own_context, member.name)
         warnings.append(warning and member.refused(warning))

@@ -162,12 +162,12 @@ def _texts(data: Any) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class MemberCase:
-    """One of several shells, with a case of its own.
+    """One of the shells of a case, with a case of its own.
 
     Attributes
     ----------
     name
-        Name of the shell in the whole case.
+        Name of the shell in the whole case; "" if that has no section `shells`.
     section
         Section of the shell in the whole case.
     case
@@ -180,7 +180,7 @@ class MemberCase:
 
     def refused(self, message: str) -> str:
         """Return a message about the shell's own case, beginning with its key in the whole case."""
-        return f"shells.{self.name}.{message}"
+        return f"shells.{self.name}.{message}" if self.name else message
 
     @contextmanager
     def naming(self) -> Iterator[None]:

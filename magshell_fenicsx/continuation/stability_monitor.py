@@ -240,6 +240,14 @@ class SymmetryBreakingModes(Protocol):
         """Return the numbers of unstable directions of all families at a state of the model."""
 
 
+def unstable_count(modes: SymmetryBreakingModes | None, state: State) -> int:
+    """Return the number of unstable directions at a state among symmetry-breaking modes.
+
+    It is 0 for a model that excludes no modes (None). Collective.
+    """
+    return sum(modes.counts(state)) if modes else 0
+
+
 @dataclass(frozen=True)
 class Crossing:
     """A point where a mode of a family is neutral.

@@ -36,6 +36,7 @@ from magshell_fenicsx.output.fields.vtu import ShellData
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.problem.requests import FrequenciesSection, StabilitySection
+from magshell_fenicsx.quantities.mode_labels import waves_of_label
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.shells.mass import Model
@@ -492,7 +493,7 @@ def _lowest_frequency(
     rigid_modes = (
         [mode for mode in modes if mode.eigenvalue == 0.0] if scene.allows_rigid_motion else []
     )
-    motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
+    motions = sum(2 if waves_of_label(mode.label) else 1 for mode in rigid_modes)
     rigid_motions = f"{motions} rigid motions, " if motions else ""
     # the first mode that is not rigid, or the last of all
     lowest_mode = modes[min(len(rigid_modes), len(modes) - 1)]

@@ -1,7 +1,7 @@
-"""The meridian of a surface of revolution, and whether formulas are axisymmetric about e3.
+"""The meridian of a surface of revolution about e3.
 
-`MeridianChart` is the chart of one meridian, or of those of several shells with one axis. The other
-functions compare a formula of x, y, z, or a field, along many meridians. Lengths are over R.
+`MeridianChart` is the chart of one meridian, or of those of several shells with one axis. Lengths
+are over R.
 
 A meridian is the profile curve of a surface of revolution, in the plane of e1 and e3 (azimuth 0).
 Its parameter s is the first coordinate of its chart; the second is 0. Several shells have one
@@ -17,18 +17,10 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Embedding
 
 Array = NDArray[np.float64]
-# azimuths (rad) by the golden angle: nothing periodic meets them all, nor anything wider than 0.01
-ANGLES = [2.399963 * i for i in range(720)]
-SMOOTH_ANGLES, SMOOTH_STRIDE = 12, 20  # azimuths, and places passed over, for a smooth field
 SAMPLES = 401  # places along a meridian
-MAX_OFFSET = 0.1  # over R, of the places beside the surface that it may move to
-OFFSET_SEED = 2026
-RELATIVE_TOLERANCE = 1e-9  # over the largest value: differences that are rounding
 
 
 @dataclass(frozen=True)
@@ -154,118 +146,3 @@ class MeridianChart:
         """Return places (n, 3) at parameters, which are given in several arrays."""
         s = np.concatenate(parameters)
         return self.embedding(np.column_stack([s, 0 * s]))
-
-
-def scalar_is_axisymmetric(text: str, meridian: MeridianChart, length: float = 1.0) -> bool:
-    """Return whether a formula has the same value all around e3.
-
-    Parameters
-    ----------
-    text
-        Formula of x, y, z.
-    meridian
-        Meridian whose places are turned about e3.
-    length
-        R in the unit of length of the formula.
-    """
-    f, places = formula(text), length * meridian.interior_sample()
-    # samples of the meridian, turned about e3 by all angles
-    values_by_angle = [f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]
-    # narrow places, and these turned to azimuth zero
-    narrow_places = length * meridian.narrow_places
-    turned_places, _ = _at_azimuth_zero(meridian.narrow_places)
-    at_azimuth_zero = length * turned_places
-    return _all_equal(values_by_angle) and _all_equal(
-        [f(*narrow_places.T)[:, None], f(*at_azimuth_zero.T)[:, None]]
-    )
-
-
-def vector_is_axisymmetric(
-    components: Sequence[str],
-    meridian: MeridianChart,
-    length: float = 1.0,
-    *,
-    in_space: bool = False,
-) -> bool:
-    """Return whether a vector field turns with the meridian and has no component across it.
-
-    Parameters
-    ----------
-    components
-        Formulas of the components.
-    length
-        R in the unit of length of the formulas.
-    in_space
-        Whether this is asked beside the surface too, up to `MAX_OFFSET` from it.
-    """
-    vectors, places = vector_function(components), meridian.interior_sample()
-    # places beside the surface are put back into the plane y = 0
-    if in_space:
-        places = with_nearby_places(places) * [1.0, 0.0, 1.0]
-    # narrow places are compared with their images at azimuth zero
-    at_azimuth_zero, Q = _at_azimuth_zero(meridian.narrow_places)
-    rotated = np.einsum("nij,nj->ni", Q, vectors(length * meridian.narrow_places))
-    return _turns_with_meridian(lambda x: vectors(length * x), places) and _all_equal(
-        [vectors(length * at_azimuth_zero), rotated]
-    )
-
-
-def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
-    """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3) that do so."""
-    rho, ones, zeros = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
-    # cosine and sine of the azimuth, which is zero on the axis
-    divisor = np.where(rho > 0, rho, 1.0)
-    c, s = np.where(rho > 0, x[:, :2].T / divisor, [[1.0], [0.0]])
-    Q = np.array([[c, s, zeros], [-s, c, zeros], [zeros, zeros, ones]])
-    return np.column_stack([rho, zeros, x[:, 2]]), np.moveaxis(Q, 2, 0)
-
-
-def field_is_axisymmetric(
-    field: Callable[[Array], Array], meridian: MeridianChart, *, smooth: bool = True
-) -> bool:
-    """Return whether a field turns with the meridian and has no component across it.
-
-    Parameters
-    ----------
-    field
-        Places (n, 3) -> vectors (n, 3).
-    smooth
-        Whether the field is as smooth as that of distant sources, so that few samples suffice.
-    """
-    places = meridian.interior_sample()
-    if smooth:
-        return _turns_with_meridian(field, places[::SMOOTH_STRIDE], ANGLES[:SMOOTH_ANGLES])
-    return _turns_with_meridian(field, places)
-
-
-def _turns_with_meridian(
-    field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES
-) -> bool:
-    """Return whether a field turns with places of the plane y = 0 and has no component along e2.
-
-    `places` are (n, 3), `angles` are azimuths in radians.
-    """
-    # vectors at each azimuth, turned back; then the first without its component along e2
-    in_plane = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
-    return _all_equal([*in_plane, in_plane[0] * [1.0, 0.0, 1.0]])
-
-
-def vector_function(components: Sequence[str]) -> Callable[[Array], Array]:
-    """Return the function of places (n, 3) to vectors (n, 3) with these formulas as components."""
-    fs = [formula(text) for text in components]
-    return lambda x: np.stack([f(*x.T) for f in fs], axis=-1)
-
-
-def with_nearby_places(x: Array) -> Array:
-    """Return places (2 n, 3): the given ones, then one at random near each."""
-    offsets = np.random.default_rng(OFFSET_SEED).uniform(-1, 1, x.shape)
-    return np.vstack([x, x + MAX_OFFSET * offsets])
-
-
-def _all_equal(values: Sequence[Array]) -> bool:
-    """Return whether arrays are equal to the first one, to rounding."""
-    first = values[0]
-    if not first.size:
-        return True
-    tolerance = RELATIVE_TOLERANCE * np.abs(first).max()
-    return all(bool((np.abs(v - first) <= tolerance).all()) for v in values)

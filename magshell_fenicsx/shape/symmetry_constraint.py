@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, Sector
 from magshell_fenicsx.mesh.multi_shell import MultiShellMesh
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
+from magshell_fenicsx.shape.field_symmetry import formula_field, is_axisymmetric, is_mirror_image
 
 if TYPE_CHECKING:  # outlines read meshes, which needs the solver
     from magshell_fenicsx.shape.outline import Outline
@@ -243,12 +242,12 @@ def shape_constraint(
     def mirrors(mirror: Mirror) -> bool:
         if not isinstance(factor, str):
             return not isinstance(factor, UserField)  # patches are mapped onto themselves
-        return mirrors_formula(factor, mirror, outline.sample())
+        return is_mirror_image(formula_field(factor), mirror, outline.sample())
 
     reason, meridian = outline.why_no_meridian, outline.meridian
     # a surface that has a meridian may still have a thickness that differs around e3
     if meridian:
-        if isinstance(factor, str) and not scalar_is_axisymmetric(factor, meridian):
+        if isinstance(factor, str) and not is_axisymmetric(formula_field(factor), meridian):
             reason = "the thickness differs around e3"
     elif reason is None and outline.round:
         reason = "the section of the tube is closed: it has no edge to hold it by"
@@ -300,26 +299,3 @@ def points_constraint(
         return all(float(mirror.signed_distance(x)) > -ROUNDING for x in places)
 
     return SymmetryConstraint(mirrors=mirrors)
-
-
-def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) -> bool:
-    """Return whether a formula is the same at places and at their mirror images.
-
-    Parameters
-    ----------
-    text
-        Formula of x, y, z.
-    x
-        (n, 3) places over R.
-    length
-        R in the unit of length of the formula.
-    """
-    f = formula(text)
-    return equal_to_rounding(f(*(length * x).T), f(*(length * mirror.image(x)).T))
-
-
-def equal_to_rounding(a: Array, b: Array) -> bool:
-    """Return whether arrays are equal to rounding of the largest value, and finite."""
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        return False
-    return bool((np.abs(a - b) <= ROUNDING * np.abs(a).max(initial=0.0)).all())

@@ -58,7 +58,7 @@ from magshell_fenicsx.parts.supports.supports import NOT_HELD, held_on, unresist
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.energy_factory import INTERIOR, EnergyFactory
 from magshell_fenicsx.shells.model_base import ThinModel
-from magshell_fenicsx.shells.waves import SymmetryBreakingWaves, Waves, largest_wave_number
+from magshell_fenicsx.shells.waves import Waves, largest_wave_number
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
@@ -473,22 +473,19 @@ class MeridianModel(ThinModel):
         copied_model.system = self.system.with_number("numbers of the case", numbers, value)
         copied_model.meridian, copied_model.material = model.meridian, model.material
         largest = largest_wave_number(model.meridian, model.material.h)
-        waves = self.waves.for_system(copied_model.system, largest)
-        copied_model.symmetry_breaking_modes = SymmetryBreakingWaves(waves)
+        copied_model.waves = self.waves.for_system(copied_model.system, largest)
         return copied_model
 
     @cached_property
-    def symmetry_breaking_modes(self) -> SymmetryBreakingWaves:
+    def waves(self) -> Waves:
         """Waves around the axis, which an axisymmetric model cannot have. Compiles kernels."""
         arguments = self.system, self.energies, self.meridian, self.domain, self.held, self.kernels
-        return SymmetryBreakingWaves(
-            Waves(*arguments, [*self.shell_contacts, *self.t_junction_terms])
-        )
+        return Waves(*arguments, [*self.shell_contacts, *self.t_junction_terms])
 
     @property
-    def waves(self) -> Waves:
-        """Waves around the axis, and the second variation along them."""
-        return self.symmetry_breaking_modes.waves
+    def symmetry_breaking_modes(self) -> Waves:
+        """The waves, as modes of the shell that the model excludes."""
+        return self.waves
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
         """Return the change of the placement by further deviations."""

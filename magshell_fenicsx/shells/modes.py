@@ -30,6 +30,7 @@ from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.parts.supports.supports import rigid_motions
+from magshell_fenicsx.quantities.mode_labels import TORSION, breaks_symmetry, wave_label
 from magshell_fenicsx.shells.mass import (
     Model,
     displacement_product,
@@ -40,13 +41,6 @@ from magshell_fenicsx.shells.mass import (
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
 from magshell_fenicsx.shells.waves import Waves
-
-TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
-# beginnings of labels of modes that a reduced model does not see
-SYMMETRY_BREAKING_LABELS = (
-    "antisymmetric",
-    "m = ",
-)
 
 
 @dataclass(frozen=True)
@@ -252,7 +246,7 @@ class ShellModes:
             If the iteration does not find it.
         """
         # "" is the label of the model's own family
-        label = label if label.startswith(SYMMETRY_BREAKING_LABELS) else ""
+        label = label if breaks_symmetry(label) else ""
         family = next(family for family in _families(self.model) if family.label == label)
         return null_vector(family.tangent(state))
 
@@ -285,7 +279,7 @@ def _families(
         free_motions = model.rigid_motions(rest.mu) if rest else None
         axial_count = len(free_motions.axial) if free_motions else 0
         yield _family_of_system("", model.system, mass, axial_count)
-        waves = model.symmetry_breaking_modes.waves
+        waves = model.waves
         wave_mass = f"{prefix}wave mass", wave_product(model, factor)
         if vibrating:
             torsions = [*free_motions.torsional] if free_motions else []
@@ -294,7 +288,7 @@ def _families(
             # motions across the axis are waves m = 1
             rigid = len(free_motions.transverse) if free_motions and m == 1 else 0
             yield _Family(
-                f"m = {m}",
+                wave_label(m),
                 partial(waves.tangent, m=m),
                 waves.constraints(m),
                 wave_mass,
@@ -307,10 +301,9 @@ def _families(
         return rigid_motions(system, model.r0, rest.mu) if rest else 0
 
     yield _family_of_system("", model.system, mass, free_motion_count(model.system))
-    if isinstance(model.symmetry_breaking_modes, AntisymmetricModes):
-        antisymmetric = model.symmetry_breaking_modes.system
-        rigid = free_motion_count(antisymmetric)
-        yield _family_of_system("antisymmetric", antisymmetric, mass, rigid)
+    if isinstance(modes := model.symmetry_breaking_modes, AntisymmetricModes):
+        rigid = free_motion_count(modes.system)
+        yield _family_of_system(modes.label, modes.system, mass, rigid)
 
 
 def _family_of_system(

@@ -131,10 +131,6 @@ class SectorModes:
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]
 
-    def is_unstable(self, state: State) -> bool:
-        """Return whether a mode that breaks the sector's symmetry is unstable; collective."""
-        return any(self.counts(state))
-
     def _turning(self, state: State) -> Vector | None:
         """Return e3 x u - du/dtheta, by which the buckled shape turns about e3; collective.
 

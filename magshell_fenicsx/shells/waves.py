@@ -42,6 +42,7 @@ from magshell_fenicsx.models.axisymmetric.wave_hessians import WaveHessians
 from magshell_fenicsx.models.domains import Energy, IntegrationDomain
 from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 from magshell_fenicsx.parts.supports.on_meridian import Supports
+from magshell_fenicsx.quantities.mode_labels import wave_label
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.t_junctions import MeridianTJunction
@@ -53,7 +54,8 @@ DEGREE = 4  # degree in m of a wave's matrix, which five values of m determine
 class Waves:
     """The second variation Q_m of an axisymmetric shell along waves cos(m theta), for any m >= 1.
 
-    Its matrices are those of coefficients (U + V, V, W) at the meridian's nodes.
+    They are the `SymmetryBreakingModes` of a meridian (`continuation.stability_monitor`). Their
+    matrices are those of coefficients (U + V, V, W) at the meridian's nodes.
 
     Parameters
     ----------
@@ -152,6 +154,19 @@ class Waves:
         if largest != self.largest:
             waves._set_largest(largest)
         return waves
+
+    @property
+    def families(self) -> Sequence[ModeFamily]:
+        """Families of a `StabilityMonitor`: one for each m from 1 to `largest`."""
+        return [WaveFamily(self, m) for m in range(1, self.largest + 1)]
+
+    @property
+    def tangents(self) -> "Waves | None":
+        """These waves, which give tangents to a `StabilityMonitor`; None with nonlocal terms.
+
+        The entries of these have no sparsity pattern in common, and are no polynomials in m.
+        """
+        return None if self.nonlocal_terms else self
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """Return the matrix of Q_m at an axisymmetric state; the next call overwrites it.
@@ -252,8 +267,8 @@ class Waves:
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
         """Return the indices m - 1 of the waves whose matrices are not positive definite.
 
-        An index is that of a wave's family (`SymmetryBreakingWaves.families`). `values` are
-        matrices that `sampled_tangents` gave.
+        An index is that of a wave's family (`families`). `values` are matrices that
+        `sampled_tangents` gave.
         """
         ranges = self._ranges
         try:
@@ -403,6 +418,27 @@ class Waves:
         return np.pi * (e.perturbed_form(u, cosine) + e.perturbed_form(u, sine)), v
 
 
+def wave_in_space(coefficients: Array, m: int, theta: Array) -> Array:
+    """Return the displacement (..., 3) of a wave m at azimuths theta.
+
+    It is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z. Torsion, m = 0, is
+    V e_theta.
+
+    Parameters
+    ----------
+    coefficients
+        (..., 3): U + V, V and W; the sum is zero on the axis.
+    theta
+        Azimuths (rad), of a shape that broadcasts with that of each coefficient.
+    """
+    U_plus_V, V, W = np.moveaxis(coefficients, -1, 0)
+    cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
+    radial, azimuthal = (U_plus_V - V) * cosine, V * sine
+    x = radial * np.cos(theta) - azimuthal * np.sin(theta)
+    y = radial * np.sin(theta) + azimuthal * np.cos(theta)
+    return np.stack([x, y, W * cosine], axis=-1)
+
+
 def largest_wave_number(meridian: Meridian, length: float) -> int:
     """Return the largest m that is examined by default; `length` is h/R.
 
@@ -486,7 +522,7 @@ class WaveFamily:
 
     @property
     def label(self) -> str:
-        return f"m = {self.m}"
+        return wave_label(self.m)
 
     def factor_at(self, state: State) -> Factorisation:
         """Factor the matrix of Q_m at an axisymmetric state.
@@ -494,34 +530,6 @@ class WaveFamily:
         The next call for these waves overwrites the factors.
         """
         return self.waves.factor_at(state, self.m)
-
-
-@dataclass(frozen=True)
-class SymmetryBreakingWaves:
-    """All waves around the axis that are examined, as symmetry-breaking modes of a meridian."""
-
-    waves: Waves
-
-    @property
-    def families(self) -> Sequence[ModeFamily]:
-        """Families of a `StabilityMonitor`: one for each m."""
-        return [WaveFamily(self.waves, m) for m in range(1, self.waves.largest + 1)]
-
-    @property
-    def tangents(self) -> Waves | None:
-        """Waves that give tangents to a `StabilityMonitor`; None with contacts or T-junctions.
-
-        The entries of these have no sparsity pattern in common, and are no polynomials in m.
-        """
-        return None if self.waves.nonlocal_terms else self.waves
-
-    def counts(self, state: State) -> Sequence[int]:
-        """Numbers of unstable directions of all families at a state."""
-        return self.waves.counts(state)
-
-    def is_unstable(self, state: State) -> bool:
-        """Whether some wave is unstable at an axisymmetric state."""
-        return any(self.waves.counts(state))
 
 
 class BandedMatrices:

@@ -21,7 +21,6 @@ from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import (
     MirroredMode,
     Mode,
-    OfShells,
     Shape,
     on_meridian,
     on_surface,
@@ -29,6 +28,7 @@ from magshell_fenicsx.parts.imperfections.modes import (
 )
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC, waves_of_label
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.shells.revolution import nodal_normals
 from magshell_fenicsx.simulate.follow import follow
@@ -118,8 +118,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
     """Return a mode as a function of the place, with largest value 1; collective.
 
     The function interpolates inward displacements at nodes. Of a half the other half's nodes, which
-    are mirror images, count too. With several shells there is one function for each shell that the
-    mode moves.
+    are mirror images, count too. There is one function for each shell that the mode moves.
     """
     model, mirror = scene.model, None
     # nodes with their displacements, and for each shell a mask of its nodes
@@ -133,7 +132,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
     node_count = len(places)
-    sign_of_image = -1.0 if mode.label == "antisymmetric" else 1.0
+    sign_of_image = -1.0 if mode.label == ANTISYMMETRIC else 1.0
     if mirror:  # images follow the nodes, in the same order
         places = np.vstack([places, mirror.image(places)])
         inward_displacements = np.concatenate(
@@ -147,7 +146,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             return on_meridian(
                 places[nodes],
                 inward_displacements[nodes],
-                int(mode.label.removeprefix("m = ") or 0),  # number of waves
+                waves_of_label(mode.label) or 0,
             )
         if not mirror:
             return on_surface(places[nodes], inward_displacements[nodes], places[nodes])
@@ -158,17 +157,12 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         # from the model's frame to that of the case
         return in_frame(MirroredMode(function, mirror, sign_of_image), -scene.problem.azimuth)
 
-    nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
-    if len(nodes_of_shell) < 2:
-        return shape_of_shell(nodes_of_shell[0])
-    names = scene.problem.context.sections["shells"]
-    return OfShells(
-        {
-            name: shape_of_shell(nodes)
-            for name, nodes in zip(names, nodes_of_shell, strict=True)
-            if np.abs(inward_displacements[nodes]).max() > MIN_DISPLACEMENT
-        }
-    )
+    names = scene.problem.context.sections.get("shells") or [""]
+    return {
+        name: shape_of_shell(nodes)
+        for name, nodes in zip(names, map(np.flatnonzero, is_of_shell), strict=True)
+        if np.abs(inward_displacements[nodes]).max() > MIN_DISPLACEMENT
+    }
 
 
 def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, RecordedValues
 from magshell_fenicsx.continuation.stability_monitor import Crossing
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.quantities.mode_labels import waves_of_label
 from magshell_fenicsx.shells.near_points import places_of_point_forces, point_of_mode
 from magshell_fenicsx.simulate.stage import Stage
 
@@ -31,8 +32,7 @@ def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
         _, vector = nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))
         return vector
 
-    # a family of waves has their number m
-    return _recorded_point(stage, path, mode, waves=getattr(family, "m", None))
+    return _recorded_point(stage, path, mode, waves=waves_of_label(crossing.label))
 
 
 def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> str:

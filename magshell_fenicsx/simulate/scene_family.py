@@ -40,6 +40,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.registered import strength_ratios
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.mode_labels import breaks_symmetry, waves_of_label
 from magshell_fenicsx.shells.waves import Waves
 from magshell_fenicsx.simulate.path_records import LOCATED
 from magshell_fenicsx.simulate.record import Record
@@ -58,7 +59,6 @@ FORCE_TOLERANCE = 1e-10  # relative differences of forces that are rounding
 SHARED_FORMS_TOLERANCE = 1e-7
 MAX_STAGES = 8  # that are remembered
 MAX_PROBLEMS = 4 * MAX_STAGES
-WAVES = "m = "  # begin of the name of a mode of waves around a meridian
 # work of a load along a mode, over the lengths of both: with less it is no fold
 MIN_FOLD_WORK = 1e-3
 INVERSE_ITERATIONS = 4  # for waves that are nearly neutral
@@ -118,7 +118,7 @@ def refuse_excluded_mode(mode: str) -> None:
     ExcludedInstability
         If the model excludes it.
     """
-    if mode.startswith(WAVES) or mode == "antisymmetric":
+    if breaks_symmetry(mode):
         raise ExcludedInstability(
             f"the instability is one that the model excludes ({mode}): take symmetry: none"
         )
@@ -222,7 +222,7 @@ class SceneFamily:
         """Find out how scenes depend on the number, and whether they can share a scene or forms."""
         self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
-        self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
+        self.m = waves_of_label(record.mode) or 0
         self._make_problem, self._range, self._record = make_problem, value_range, record
         self._problems: dict[float, Problem] = {}
         self._stages: dict[float, Stage] = {}

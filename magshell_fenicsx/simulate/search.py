@@ -30,6 +30,7 @@ from magshell_fenicsx.continuation.search import (
     Settling,
     further_solutions,
 )
+from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import SearchSection
@@ -299,7 +300,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     )
     for number, solution in enumerate(solutions_found, 1):
         point = stage.point(solution)
-        unstable = sum(excluded_modes.counts(point.state)) if excluded_modes else 0
+        unstable = unstable_count(excluded_modes, point.state)
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
 
 

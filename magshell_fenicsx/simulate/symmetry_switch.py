@@ -42,9 +42,11 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import compat
+from magshell_fenicsx.quantities.mode_labels import waves_of_label
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.shells.waves import wave_in_space
 from magshell_fenicsx.simulate.contact_control import passes, with_cuts_here, with_own_contact
 from magshell_fenicsx.simulate.path_records import Records, RecordStream, amount, follow_branch
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -53,7 +55,6 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.transfer import nodes_by_shell
 
 Array = NDArray[np.float64]
-WAVES = "m = "  # begin of the name of a mode of waves around a meridian
 NEIGHBOURS = 24  # nodes through which a cubic polynomial runs
 MAX_CONTACT_CHANGES = 10  # times that a carried state gets stiffer penalties or new cuts
 FIRST_STEP = 0.1  # step of a branch by arc length
@@ -205,8 +206,8 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
         If no larger model can be built.
     """
     symmetries: list[int | str] = ["none"]
-    if mode.startswith(WAVES):  # from the smallest model: the sector of 180/m degrees
-        symmetries = [int(mode.removeprefix(WAVES)), "half", "none"]
+    if m := waves_of_label(mode):  # from the smallest model: the sector of 180/m degrees
+        symmetries = [m, "half", "none"]
     first_reason = ""  # why the first one cannot be built
     for symmetry in symmetries:
         try:
@@ -447,7 +448,8 @@ def _carried_over(
     system, u = new.model.system, bifurcation.point.state.u
     if old.model.axisymmetric:
         s, theta = _along_meridian(old, new)
-        m = int(bifurcation.mode.removeprefix(WAVES))
+        m = waves_of_label(bifurcation.mode)
+        assert m
         displacement, new_mode = _revolved(old.model, s, theta, u, mode, m)
     else:
         displacement, new_mode = _mirrored(old, new, u, mode)
@@ -478,9 +480,7 @@ def _revolved(
 ) -> tuple[Array, Array]:
     """Return displacement and wave of a meridian at places of a surface, (n, 3) each.
 
-    The wave is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z, in cylindrical
-    coordinates. Its unknowns are U + V, V and W, as U + V is zero on the axis. Its sign is such
-    that the largest crest at theta = 0 is inwards.
+    The sign of the wave is such that its largest crest at theta = 0 is inwards.
 
     Parameters
     ----------
@@ -492,25 +492,14 @@ def _revolved(
         Unknowns (U + V, V, W) of the wave, and its number of crests.
     """
     radial, axial = _evaluated(model, model.V, u, s).T
-    U_and_V, V, W = _evaluated(model, model.symmetry_breaking_modes.waves.V, wave, s).T
-    cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
-    e_rho, e_theta = np.column_stack([cos, sin, zero]), np.column_stack([-sin, cos, zero])
-
-    def in_space(a: Array, b: Array, c: Array) -> Array:
-        """Return vectors (n, 3) with components along e_rho, e_theta and e_z."""
-        return np.asarray(
-            a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c])
-        )
-
-    wave_in_space = in_space(
-        (U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta)
-    )
-    return in_space(radial, zero, axial), _sign(model, wave) * wave_in_space
+    displacement = np.column_stack([radial * np.cos(theta), radial * np.sin(theta), axial])
+    coefficients = _evaluated(model, model.waves.V, wave, s)
+    return displacement, _sign(model, wave) * wave_in_space(coefficients, m, theta)
 
 
 def _sign(model: MeridianModel, wave: Vector) -> float:
     """Return the sign, 1 or -1, with which a wave's largest crest at azimuth 0 is inwards."""
-    V = model.symmetry_breaking_modes.waves.V
+    V = model.waves.V
     # along the meridian, so that of two equal crests always the same one counts
     values = wave.reshape(-1, 3)[np.argsort(V.tabulate_dof_coordinates()[:, 0])]
     # U at azimuth 0; a little of W decides where U is zero

@@ -28,6 +28,7 @@ from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.device import HeldConjugate
 from magshell_fenicsx.continuation.motion import Motion
+from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator, Surroundings
 from magshell_fenicsx.input.section import in_units
@@ -35,7 +36,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection
 from magshell_fenicsx.parts.step_course import SnapSection
-from magshell_fenicsx.shape.meridian_chart import vector_function
+from magshell_fenicsx.shape.field_symmetry import formula_field
 from magshell_fenicsx.shells.mass import SupportInertia, mass, mass_with_supports
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.viscous import Branch, Viscosity
@@ -449,9 +450,9 @@ def _excluded_pivots(scene: Scene, state: State) -> int:
 
     It is 0 for a shell that moves freely, whose rigid motions would count.
     """
-    # the modes that the model excludes by its symmetry, in families; None if there are none
-    symmetry_breaking_modes = None if scene.free_in_time else scene.model.symmetry_breaking_modes
-    return sum(symmetry_breaking_modes.counts(state)) if symmetry_breaking_modes else 0
+    if scene.free_in_time:
+        return 0
+    return unstable_count(scene.model.symmetry_breaking_modes, state)
 
 
 def _event_function(
@@ -588,7 +589,7 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     unit, axes = scene.problem.time_unit or 1.0, model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
     # the formulas take places in the case's frame and units, and give velocities in these
-    velocity = vector_function(components)(R * places @ Q) @ Q.T * unit / R
+    velocity = formula_field(components)(R * places @ Q) @ Q.T * unit / R
     owned = np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
     return np.asarray(model.system.zero_at_supports(owned))
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_fold, predict_fold
+from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.simulate.perfect import with_modes
@@ -75,17 +76,9 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
-    if _is_unstable(scene, fold):
+    # the first access to modes that a reduced model excludes is collective
+    if fold.unstable or unstable_count(scene.model.symmetry_breaking_modes, fold.state):
         raise FoldLost("another instability comes before the fold")
-
-
-def _is_unstable(scene: Scene, fold: Fold) -> bool:
-    """Return whether the shell is unstable at a fold in another direction; collective."""
-    # modes that a reduced model excludes; the first access is collective
-    modes = scene.model.symmetry_breaking_modes
-    if fold.unstable:
-        return True
-    return modes is not None and modes.is_unstable(fold.state)
 
 
 def _constant_amplitudes(scene: Scene) -> dict[str, float]:

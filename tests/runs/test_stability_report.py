@@ -170,8 +170,7 @@ def test_waves_of_the_perfect_hemisphere() -> None:
         if mode.eigenvalue < 0 and mode.label
     )
     assert unstable == {
-        f"m = {m}": n
-        for m, n in scene.model.symmetry_breaking_modes.waves.unstable(limit.point.state).items()
+        f"m = {m}": n for m, n in scene.model.waves.unstable(limit.point.state).items()
     }
     assert len(unstable) > 3
 
@@ -214,9 +213,7 @@ def test_translation_as_a_wave() -> None:
     free.
     """
     scene = plate("axisymmetric")
-    coefficients = np.tile(
-        [0.0, -1.0, 0.0], scene.model.symmetry_breaking_modes.waves.V.dofmap.index_map.size_global
-    )
+    coefficients = np.tile([0.0, -1.0, 0.0], scene.model.waves.V.dofmap.index_map.size_global)
     surface = surface_of(scene, scene.model.zero(), "m = 1", coefficients)
     assert np.abs(np.abs(surface.fields["mode"]) - [1.0, 0.0, 0.0]).max() < 1e-12
     assert np.ptp(surface.fields["mode"][:, 0]) < 1e-12

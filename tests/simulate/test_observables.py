@@ -179,9 +179,7 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     parts = (tangent.K, tangent.N) if isinstance(tangent, SkewedTangent) else (tangent,)
     values = [np.array(part.getValuesCSR()[2]) for part in parts]
     if isinstance(scene.model, MeridianModel):
-        values.append(
-            np.array(scene.model.symmetry_breaking_modes.waves.tangent(state, 2).getValuesCSR()[2])
-        )
+        values.append(np.array(scene.model.waves.tangent(state, 2).getValuesCSR()[2]))
     return [
         shown,
         np.array(numbers),

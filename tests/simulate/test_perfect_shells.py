@@ -101,8 +101,12 @@ def test_modes_of_half_and_full_shells() -> None:
     }
     panel = Case.from_source(Source("panel.yaml", data))
     x = outline(panel.shell).sample()
-    whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}).problem(), 2, MPI.COMM_SELF)
-    halves = perfect_modes(panel.problem(), 2, MPI.COMM_SELF)
+    whole_problem = panel.model_copy(update={"symmetry": "none"}).problem()
+    # the part of each mode on the only shell
+    whole, halves = (
+        [mode[""] for mode in perfect_modes(problem, 2, MPI.COMM_SELF)]
+        for problem in (whole_problem, panel.problem())
+    )
     for one, other in zip(whole, halves, strict=True):
         assert np.abs(other(x)).max() == pytest.approx(1, abs=0.04)
         assert alike(one(x), other(x), 0.02)
@@ -118,6 +122,33 @@ CAP = {"geometry": "cap", "radius": 1, "polar": 40, "poisson_ratio": 0.3}
 
 def of(data: dict[str, Any]) -> Case:
     return Case.from_source(Source("case.yaml", data))
+
+
+@pytest.mark.slow
+def test_a_single_shell_takes_its_mode_along_to_its_place() -> None:
+    """A section `shells` may have one shell, whose mode is known in the frame of the case."""
+    shell = {"geometry": "plate", "length": 1, "width": 0.3, "thickness": 0.02}
+    shell |= {"poisson_ratio": 0.3, "imperfections": [{"kind": "modes", "amplitudes": [0.3]}]}
+    held = {"left": "clamped", "right": "clamped"}
+
+    def mode(place: dict[str, Any], way: list[float]) -> Any:
+        """The mode of the plate, compressed along its first axis, in its own frame."""
+        move = {"supports": ["a.right"], "translation": way}
+        data = {"shells": {"a": {"shell": shell, "boundary": held, "place": place}}}
+        plate = of(
+            data
+            | {"mesh": {"size": 0.15, "degree": 3}, "loading": {"kind": "edge", "moves": [move]}}
+        )
+        with_modes(plate.problem(), MPI.COMM_SELF)
+        (member,) = plate.members
+        (found,) = member.case.imperfections["imperfections.0"].shapes  # type: ignore[attr-defined]
+        return found
+
+    x = np.column_stack([np.linspace(0.05, 0.95, 7), np.full(7, 0.1), np.zeros(7)])
+    upright = {"position": [0.3, 0.2, 0.1], "axis": {"polar": 90, "azimuth": 90}}
+    here, there = mode({}, [-0.01, 0, 0]), mode(upright, [0, 0, 0.01])
+    assert np.abs(here(x)).max() > 0.9
+    assert alike(here(x), there(x), 1e-6)
 
 
 @pytest.mark.slow

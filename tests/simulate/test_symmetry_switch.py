@@ -196,7 +196,7 @@ def test_handing_over_is_continuous_to_the_meshes_error() -> None:
     one, two = old.scene.observe(old.point.state), new.scene.observe(new.point.state)
     for column in ("energy", "volume_change", "w_pole_over_h"):
         assert two[column] == pytest.approx(one[column], rel=3e-4)
-    waves = old.scene.model.symmetry_breaking_modes.waves
+    waves = old.scene.model.waves
     stiff = abs(nearest_to_zero(waves.factor_at(records[1].point.state, 5))[0])
     assert abs(nearest_to_zero(waves.factor_at(old.point.state, 5))[0]) < 1e-6 * stiff
     lowest = ShellModes(new.scene.model).lowest(new.point.state, 2)

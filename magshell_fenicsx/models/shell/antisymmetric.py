@@ -26,6 +26,7 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC
 
 
 def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an addition v
@@ -90,7 +91,7 @@ class AntisymmetricModes:
         Factors of the latest tangent, and the state to which they belong; None before the first.
     """
 
-    label = "antisymmetric"
+    label = ANTISYMMETRIC
     tangents = None  # all modes are one family, with one tangent
 
     def __init__(self, system: FiniteElementSystem) -> None:
@@ -107,10 +108,6 @@ class AntisymmetricModes:
             self._factorisation.factor(self.system.tangent(state.u, state.mu))
             self._factored = state
         return self._factorisation
-
-    def is_unstable(self, state: State) -> bool:
-        """Return whether an antisymmetric mode is unstable at a symmetric state; collective."""
-        return self.factor_at(state).negative_pivots > 0
 
     @property
     def families(self) -> Sequence[ModeFamily]:

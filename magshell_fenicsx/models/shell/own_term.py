@@ -38,8 +38,8 @@ from magshell_fenicsx.models.shell.kinematics import (
     Jet,
 )
 from magshell_fenicsx.platform.lazy_import import lazy_import
-from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
-from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, mirrors_formula
+from magshell_fenicsx.shape.field_symmetry import formula_field, is_axisymmetric, is_mirror_image
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     import ufl
@@ -118,11 +118,11 @@ class FormulaParameter:
 
         An outline without a meridian is not a surface of revolution.
         """
-        return outline.meridian is not None and scalar_is_axisymmetric(self.text, outline.meridian)
+        return is_axisymmetric(formula_field(self.text), outline.meridian)
 
     def mirrored(self, mirror: Mirror, outline: Outline) -> bool:
         """Return whether a plane mirrors the formula."""
-        return mirrors_formula(self.text, mirror, outline.sample())
+        return is_mirror_image(formula_field(self.text), mirror, outline.sample())
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,9 @@ from magshell_fenicsx.output.fields.surface import Surface, completed_by_symmetr
 from magshell_fenicsx.output.fields.vtu import ShellData, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import read_csv, table_text
-from magshell_fenicsx.shells.modes import TORSION
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC, WAVES, waves_of_label
 from magshell_fenicsx.shells.revolution import Revolution
+from magshell_fenicsx.shells.waves import wave_in_space
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -35,7 +36,6 @@ if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.solid import SolidModel
 
 Array = NDArray[np.float64]
-WAVES = "m = "
 CREST_TOLERANCE = 1e-6  # relative to the largest normal component of a mode
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
@@ -81,11 +81,9 @@ def mode_surface(
     On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and
     "mode_w" (n,), the component of the mode along -n0; None on other ranks.
     """
-    is_wave = label.startswith(WAVES) or label == TORSION
-    if is_wave and model.axisymmetric:
+    if (m := waves_of_label(label)) is not None and model.axisymmetric:
         if gatherer.comm.rank:
             return None
-        m = 0 if label == TORSION else int(label.removeprefix(WAVES))
         displaced_meridian, wave = _revolved_wave(model, u, m, vector)
         return _with_mode(displaced_meridian, wave)
     # the mode is gathered like a displacement: it is the `u` of a second surface
@@ -96,7 +94,7 @@ def mode_surface(
     if model.multiplicity > 1:  # the model is a half or a sector
         assert not model.axisymmetric
         surface = completed_by_symmetry(surface, model.mirror)
-        if label == "antisymmetric":
+        if label == ANTISYMMETRIC:
             # nodes of the modelled half come first, those of its image after them
             for values in surface.fields.values():
                 values[len(displaced.r0) :] *= -1
@@ -187,32 +185,23 @@ def _revolved_wave(
 ) -> tuple[Surface, Array]:
     """Return the surface of revolution of a displaced meridian, and a wave (n, 3) at its nodes.
 
-    The surface has at least twelve sectors for each wave. The wave is v = U cos(m theta) e_rho + V
-    sin(m theta) e_theta + W cos(m theta) e_z; torsion, m = 0, is V e_theta.
+    The surface has at least twelve sectors for each wave.
 
     Parameters
     ----------
     u
         Displacement of the meridian.
     m
-        Number of waves.
+        Number of waves; 0: torsion.
     vector
         Coefficients (U + V, V, W) at the nodes of the meridian.
     """
     sectors = max(96, 12 * m)  # 96 even without waves, for a round picture
     swept = Revolution(model, sectors)
     # numbers of the circles of nodes in the function space of the waves
-    vertices = swept.vertices(model.symmetry_breaking_modes.waves.V)
-    # each (circles, 1); the first one is the sum of U and V
-    U_plus_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
+    vertices = swept.vertices(model.waves.V)
     theta = np.arange(sectors) * 2 * np.pi / sectors
-    # torsion, m = 0, is V alone, the same at all angles
-    cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
-    radial, azimuthal = (U_plus_V - V) * cosine, V * sine
-    # (circles, sectors): from components along and around the axis to those along e1, e2 and e3
-    x = radial * np.cos(theta) - azimuthal * np.sin(theta)
-    y = radial * np.sin(theta) + azimuthal * np.cos(theta)
-    v = np.stack([x, y, W * cosine], axis=-1)
+    v = wave_in_space(vector.reshape(-1, 3)[vertices][:, None], m, theta)  # (circles, sectors, 3)
     surface = Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, fields={})
     return surface, swept.at_nodes(v)
 

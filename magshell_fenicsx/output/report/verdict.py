@@ -24,6 +24,7 @@ from markupsafe import Markup
 from magshell_fenicsx.output.store.durable import damage
 from magshell_fenicsx.output.store.stored_results import is_flat, pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC
 from magshell_fenicsx.quantities.quantity import Quantity, plain_text
 from magshell_fenicsx.quantities.registry import (
     OWN_MODES,
@@ -503,7 +504,7 @@ def _instability(
     """
     kind = line["label"]  # "fold" or "bifurcation", then the mode in brackets
     if line["mode"]:  # a number of waves, or a symmetry in words
-        is_wave = line["mode"] not in (*OWN_MODES, "antisymmetric")
+        is_wave = line["mode"] not in (*OWN_MODES, ANTISYMMETRIC)
         kind += f" ({line['mode']}{' waves' if is_wave else ''})"
     load = value(line, summary)
     displacement = _displacement(line, pole_name(line, pole_of(summary["case"])), lines)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from magshell_fenicsx.input.expressions import Formula, formula_function, is_formula, symbolic
+from magshell_fenicsx.input.expressions import Formula, is_formula, symbolic
 from magshell_fenicsx.input.section import Section, in_units, or_number
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
@@ -28,18 +28,14 @@ from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step_course import LoadStart, MeshHints, SizingContext, Target, Until
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.shape.meridian_chart import (
-    MeridianChart,
-    scalar_is_axisymmetric,
-    vector_is_axisymmetric,
+from magshell_fenicsx.shape.field_symmetry import (
+    FieldFunction,
+    formula_field,
+    is_axisymmetric,
+    is_mirror_image,
 )
-from magshell_fenicsx.shape.symmetry_constraint import (
-    SymmetryConstraint,
-    equal_to_rounding,
-    mirrors_formula,
-    tilted,
-    unit,
-)
+from magshell_fenicsx.shape.meridian_chart import MeridianChart
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, tilted, unit
 
 if TYPE_CHECKING:
     from ufl.core.expr import Expr
@@ -319,7 +315,8 @@ class DeadSection(PathStep):
                 abs(float(mirror.signed_distance(place))) < ROUNDING for place in places
             )
             keeps_potentials = has_points and all(
-                mirrors_formula(text, mirror, sampled_places, length) for text in potentials
+                is_mirror_image(formula_field(text, length), mirror, sampled_places)
+                for text in potentials
             )
             return keeps_potentials and all(
                 _has_image(load, self.loads, mirror, sampled_places, length) for load in self.loads
@@ -353,7 +350,7 @@ class DeadSection(PathStep):
         """
         # whether formulas are the same all around e3; that is known on a meridian alone, and else
         # taken to be so
-        is_axisymmetric = not meridian or self._formulas_are_axisymmetric(meridian, length)
+        is_same_around = not meridian or self._formulas_are_axisymmetric(meridian, length)
         if any(tilted(v) for v in vectors):
             return "a load is not along e3, or off the axis"
         # `over` names a part that is the same all around e3 if it is "all", or one shell of several
@@ -361,16 +358,13 @@ class DeadSection(PathStep):
         shell_names = [shell.name for shell in meridian.shell_meridians] if meridian else []
         if any(load.over not in (None, "all", *shell_names) for load in self.loads):
             return "a patch is loaded"
-        return None if is_axisymmetric else "a load differs around e3"
+        return None if is_same_around else "a load differs around e3"
 
     def _formulas_are_axisymmetric(self, meridian: MeridianChart, length: float) -> bool:
         """Return whether the formulas of all loads and potentials are the same all around e3."""
-        loads_turn = all(load_turns(load, meridian, length) for load in self.loads if load.varies)
-        return loads_turn and all(
-            scalar_is_axisymmetric(load.potential, meridian, length)
-            for load in self.loads
-            if load.potential
-        )
+        fields = [_load_field(load, length) for load in self.loads if load.varies]
+        fields += [formula_field(load.potential, length) for load in self.loads if load.potential]
+        return all(is_axisymmetric(field, meridian) for field in fields)
 
     def concentrated(self, context: Context, outline: "Outline") -> Sequence[str]:
         return [load.at for load in self.loads if load.at]
@@ -440,19 +434,6 @@ class DeadSection(PathStep):
         return Loads(dead={name: tuple(dead_loads)})
 
 
-def load_turns(load: DeadLoadSection, meridian: MeridianChart, R: float) -> bool:
-    """Return whether a load by formula is the same all around e3.
-
-    Parameters
-    ----------
-    R
-        Length of the shell in the unit of the formula's places.
-    """
-    if load.vector is None:
-        return scalar_is_axisymmetric(str(load.pressure), meridian, R)
-    return vector_is_axisymmetric([str(v) for v in load.vector], meridian, R)
-
-
 def is_normal(components: Sequence[Varying], outline: "Outline", length: float) -> bool:
     """Return whether a load by formulas is along the undeformed normals of a curved surface.
 
@@ -467,7 +448,7 @@ def is_normal(components: Sequence[Varying], outline: "Outline", length: float) 
     if sampled is None:  # normals are not known
         return False
     places, normals = sampled
-    load = np.stack([formula_function(v)(*(length * places).T) for v in components], axis=-1)
+    load = formula_field(components, length)(places)
     largest_tangential = np.linalg.norm(np.cross(load, normals), axis=1).max()
     # on a plane any load along the one normal would pass, though no pressure of a fluid is meant
     is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
@@ -495,10 +476,13 @@ def is_image(
     R
         Length of the shell in the unit of formulas' places.
     """
-    if load.varies or other.varies:  # values of formulas are compared at places and their images
-        return _mirrored_formula(load, other, mirror, x=R * x, image=R * mirror.image(x))
-    # points, patches, moments and pressures must be the same, and edges images of each other
     edge = load.edge and mirror.image_of_edge(load.edge)
+    if load.varies or other.varies:  # values of formulas are compared at places and their images
+        # both must be vectors, or both pressures, on edges that are images or over the same part
+        if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
+            return False
+        return is_mirror_image(_load_field(load, R), mirror, x, image=_load_field(other, R))
+    # points, patches, moments and pressures must be the same, and edges images of each other
     if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
         other.at,
@@ -520,30 +504,9 @@ def is_image(
     return True
 
 
-def _mirrored_formula(
-    load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array
-) -> bool:
-    """Return whether a plane mirrors one load by formula to another, at sampled places.
-
-    Parameters
-    ----------
-    x, image
-        (n, 3) places and their mirror images, in the unit of formulas.
-    """
-    # both must be vectors, or both pressures, on edges that are images or over the same part
-    edge = load.edge and mirror.image_of_edge(load.edge)
-    if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
-        return False
-    values, image_values = _values_at(load, x), _values_at(other, image)
-    # a pressure has no direction to reflect
-    mirrored_values = values if load.vector is None else values @ mirror.reflection
-    return equal_to_rounding(mirrored_values, image_values)
-
-
-def _values_at(load: DeadLoadSection, places: Array) -> Array:
-    """Return the components (n, 3) of a load at places (n, 3), or its pressure (n, 1)."""
-    components = load.vector or [load.pressure or 0.0]
-    return np.stack([formula_function(v)(*places.T) for v in components], axis=-1)
+def _load_field(load: DeadLoadSection, R: float) -> FieldFunction:
+    """Return the vector of a load, or its pressure, as a field; R is as in `is_image`."""
+    return formula_field(load.vector or load.pressure or 0.0, R)
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # SciPy takes its time, and a case alone does not need it
 
 Array = NDArray[np.float64]
 Shape = Callable[[Array], Array]
+Mode = Mapping[str, Shape]  # name of each shell that the mode moves -> its part; "": one shell
 CREST_TOLERANCE = (
     1e-4  # part of the largest value within which crests and troughs are equally large
 )
@@ -104,7 +105,7 @@ class ModesSection(FileKeys, ImperfectionSection):
         modes
             The modes, the lowest first.
         name
-            Name of the shell, if the modes are those of several shells together.
+            Name of the shell in the modes.
         place
             Pose of that shell among the others; None without.
 
@@ -115,11 +116,9 @@ class ModesSection(FileKeys, ImperfectionSection):
         """
 
         def part_of(mode: Mode) -> Shape | None:
-            """Return the part of a mode on this shell; None if the mode does not move it."""
-            if not isinstance(mode, OfShells):
-                return mode
-            # of several shells: the part on this one, in its own frame
-            return PlacedMode(mode.parts[name], place) if place and name in mode.parts else None
+            """Return the part of a mode in the frame of this shell; None if it does not move it."""
+            shape = mode.get(name)
+            return PlacedMode(shape, place) if shape and place else shape
 
         parts = [part_of(mode) for mode in modes[: len(self.amplitudes)]]
         # if there are modes with an amplitude, at least one of them must move this shell
@@ -144,7 +143,7 @@ class ModesSection(FileKeys, ImperfectionSection):
         h = reference.h
         if self.file is not None and self.shapes is None:
             mode = _read(self, reference.perfect.sample(), f"{key}.file: {self.file}")
-            self.become((mode,))
+            self.become(({"": mode},))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
         # words such as "0.1 h of mode 1 (m = 3)"; m is the number of waves around e3, of a mode
@@ -245,22 +244,6 @@ class PlacedMode:
     def m(self) -> int | None:
         """The number of waves around e3, of one that has it."""
         return getattr(self.shape, "m", None)
-
-
-@dataclass(frozen=True)
-class OfShells:
-    """A mode of several shells together.
-
-    Attributes
-    ----------
-    parts
-        Name of each shell that the mode moves -> the mode on this shell.
-    """
-
-    parts: Mapping[str, Shape]
-
-
-Mode = Shape | OfShells
 
 
 def on_surface(places: Array, w: Array, cover: Array) -> "ScatteredSpline":

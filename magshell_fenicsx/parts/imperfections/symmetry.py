@@ -24,17 +24,20 @@ from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, Local
 from magshell_fenicsx.parts.step_course import SizingContext
-from magshell_fenicsx.shape.meridian_chart import ANGLES
+from magshell_fenicsx.shape.field_symmetry import (
+    ANGLES,
+    FIELD_TOLERANCE,
+    equal_to_rounding,
+    is_mirror_image,
+)
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.reference_shell import AngularDistance, StraightDistance
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, common_azimuth
 
 Array = NDArray[np.float64]
-EQUALITY_TOLERANCE = 1e-9  # of the largest w0
 COMPARED_PARTS_OF_REACH = (0.2, 0.5, 0.8)  # of the reach, at which a local imperfection is compared
-IMAGE_TOLERANCE = (
-    1e-12  # places, depths and widths that differ by less are equal: of w0 that is far below SAME
-)
+# places, depths and widths that differ by less are equal: of w0 that is far below FIELD_TOLERANCE
+IMAGE_TOLERANCE = 1e-12
 FIRST_COMPARED = 3  # imperfections without an image that are looked at before all places are
 CONTOUR_CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
 CONTOUR_STEPS, FALSE_POSITION_ROUNDS = 40, 12
@@ -154,7 +157,7 @@ class _Sum:
         # is decided
         centres = rows[np.flatnonzero(has_no_image)[:FIRST_COMPARED], :3]
         difference = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
-        return False if difference > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
+        return False if difference > 2 * FIELD_TOLERANCE * np.abs(depths).sum() else None
 
 
 def imperfection_constraints(
@@ -191,9 +194,7 @@ def imperfection_constraints(
                 return False
             if answer is None:
                 undecided.append(group)
-        return all(
-            _are_equal(group(sample()), group(mirror.image(sample()))) for group in undecided
-        )
+        return all(is_mirror_image(group, mirror, sample()) for group in undecided)
 
     # why the shell is not axisymmetric; None if it is
     centres = [i.centre for i in imperfections.values() if i.centre is not None]
@@ -221,7 +222,7 @@ def _differ_around_e3(groups: Sequence[_Sum], places: Array) -> bool:
     for a in ANGLES[:24]:
         w0_of_groups = [group(places @ rotation(a)) for group in groups]
         w0_at_angles.append(np.concatenate(w0_of_groups))
-    return not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles)
+    return not all(equal_to_rounding(w0_at_angles[0], w0) for w0 in w0_at_angles)
 
 
 def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
@@ -264,12 +265,6 @@ def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline)
                 for part in COMPARED_PARTS_OF_REACH
             ]
     return np.concatenate(places)
-
-
-def _are_equal(w0: Array, image: Array) -> bool:
-    """Return whether deviations w0 are equal to those at the image places, up to rounding."""
-    largest = max(np.abs(w0).max(), np.abs(image).max())
-    return bool((np.abs(w0 - image) <= EQUALITY_TOLERANCE * largest).all())
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ leaves to a model.
   to a model.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import sqrt
@@ -52,19 +52,18 @@ from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.shell_sections import MeshSurface
-from magshell_fenicsx.shape.meridian_chart import (
-    field_is_axisymmetric,
-    scalar_is_axisymmetric,
-    vector_function,
-    vector_is_axisymmetric,
+from magshell_fenicsx.shape.field_symmetry import (
+    FieldFunction,
+    equal_to_rounding,
+    formula_field,
+    is_axisymmetric,
+    is_mirror_image,
     with_nearby_places,
 )
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry_constraint import (
     PARALLEL,
     SymmetryConstraint,
-    equal_to_rounding,
-    mirrors_formula,
     no_plane,
     tilted,
 )
@@ -72,6 +71,7 @@ from magshell_fenicsx.shape.symmetry_constraint import (
 Array = NDArray[np.float64]
 MIRROR_TOLERANCE = 1e-10  # difference of a uniform vector from its mirror image: rounding
 EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
+NORMALS_SEED, SAMPLED_NORMALS = 7, 40  # random directions that stand for all normals
 
 
 def by_points(section: RemanentSection, turn: float = 0.0) -> ControlledPattern:
@@ -226,7 +226,7 @@ def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
 
     Only a formula can break the symmetry here: patches are mapped onto themselves.
     """
-    return not isinstance(chi, str) or mirrors_formula(chi, mirror, outline.sample())
+    return not isinstance(chi, str) or is_mirror_image(formula_field(chi), mirror, outline.sample())
 
 
 def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:
@@ -294,23 +294,24 @@ class _MagneticVectors:
         Remanences and applied fields that vary: places (n, 3) -> vectors (n, 3).
     sources
         Fields of sources, functions like `fields`; they are smooth.
-    patterns
-        Patch -> its remanence, if that is a pattern in the frame of the patch.
+    along_normals
+        Remanences that depend on the normal alone: radial and tangential ones.
+    varying_patterns
+        Patch -> its remanence, if that is another pattern in the frame of the patch. These are in
+        `fields` too.
     by_points
         The remanence as vectors at points in space; None without a file. It is in `fields` too.
-    kind
-        Kind of the section `remanent`: "radial", "tangential" or another.
     is_beside_surface
         Whether the applied field is a formula of the deformed place, which lies off the surface.
     """
 
     vectors: Sequence[Array]
     turned_directions: Sequence[Array]
-    fields: Sequence[Callable[[Array], Array]]
-    sources: Sequence[Callable[[Array], Array]]
-    patterns: Mapping[str, PosedPattern]
+    fields: Sequence[FieldFunction]
+    sources: Sequence[FieldFunction]
+    along_normals: Sequence[Pattern]
+    varying_patterns: Mapping[str, PosedPattern]
     by_points: ControlledPattern | None
-    kind: str
     is_beside_surface: bool
 
     def has_mirror(self, mirror: Mirror, outline: Outline) -> bool:
@@ -334,32 +335,23 @@ class _MagneticVectors:
             for v in (*self.vectors, *self.turned_directions)
         )
         fields_have_images = all(
-            equal_to_rounding(
-                sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
-            )
-            for field, places in places_of_fields
+            is_mirror_image(field, mirror, places, sign=sign) for field, places in places_of_fields
         )
         if not vectors_have_images or not fields_have_images:
             return False
-        return self._patterns_have_images(S, sign)
+        return self._remanence_along_normals_has_image(S, sign)
 
-    def _patterns_have_images(self, S: Array, sign: float) -> bool:
-        """Return whether radial and tangential remanences are mapped to `sign` times themselves.
+    def _remanence_along_normals_has_image(self, S: Array, sign: float) -> bool:
+        """Return whether a reflection S maps radial and tangential remanences to `sign` times them.
 
-        A radial remanence is its own mirror image. A tangential one is so for planes through its
-        axis, and its opposite for planes normal to that. S is the reflection (3, 3).
+        They depend on the normal alone, and random directions stand for all normals.
         """
-        # of the section's own kind, about e3; S[2, 2] is 1 for planes through e3, -1 across it
-        sign_of_kind = {"radial": 1.0, "tangential": float(S[2, 2])}
-        # of patches with patterns, each about the axis of its own frame
-        for pattern in self.patterns.values():
-            axis = pattern.place.Q[:, 2]
-            if pattern.pattern is radial and sign != 1.0:
-                return False
-            is_mapped = np.abs(S @ axis - sign * axis).max() <= EQUALITY_TOLERANCE
-            if pattern.pattern is tangential and not is_mapped:
-                return False
-        return sign_of_kind.get(self.kind, sign) == sign
+        directions = np.random.default_rng(NORMALS_SEED).normal(size=(1, SAMPLED_NORMALS, 3))
+        n = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        return all(
+            equal_to_rounding(pattern(0 * n, n) @ S, sign * pattern(0 * n, n @ S))
+            for pattern in self.along_normals
+        )
 
 
 def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
@@ -398,19 +390,26 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
         vectors.append(applied.vector())
     remanent = remanent or RemanentSection.model_construct()
     assert not isinstance(remanent.components, UserField)  # has no symmetry, see the caller
-    patterns = {
-        name: remanence
-        for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
-        if isinstance(remanence, PosedPattern)
-    }
+    # the whole shell, or a patch, has a remanence along its normals, or one that varies otherwise
+    along_normals = list[Pattern]()
+    if remanent.kind in ("radial", "tangential"):
+        along_normals.append(radial if remanent.kind == "radial" else tangential)
+    varying_patterns = dict[str, PosedPattern]()
+    for name, remanence in zip(remanent.patches or {}, remanences, strict=False):
+        if not isinstance(remanence, PosedPattern):
+            continue
+        if remanence.pattern in (radial, tangential):
+            along_normals.append(remanence)
+        else:
+            varying_patterns[name] = remanence
     # fields that vary: of the gradient, of formulas, of points and of patches
     G = np.array(applied.gradient or np.zeros((3, 3)))
-    fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
-    fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
+    fields: list[FieldFunction] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
+    fields += [formula_field(texts) for texts in (remanent.components, formulas) if texts]
     pattern_by_points = by_points(remanent) if remanent.file else None
     if pattern_by_points:
         fields.append(partial(_at_places, pattern_by_points))
-    fields += [partial(_at_places, pattern) for pattern in _varying_patterns(patterns).values()]
+    fields += [partial(_at_places, pattern) for pattern in varying_patterns.values()]
     rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
     rotations = [] if rotates_as_whole else _rotations(context)
     return _MagneticVectors(
@@ -418,20 +417,11 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
         turned_directions=[step.to.vector() for step in rotations],
         fields=fields,
         sources=values(context) if applied.sources or rotates_as_whole else [],
-        patterns=patterns,
+        along_normals=along_normals,
+        varying_patterns=varying_patterns,
         by_points=pattern_by_points,
-        kind=remanent.kind,
         is_beside_surface=bool(formulas),
     )
-
-
-def _varying_patterns(patterns: Mapping[str, PosedPattern]) -> dict[str, PosedPattern]:
-    """Return the patterns that are neither radial nor tangential, by patch."""
-    return {
-        name: pattern
-        for name, pattern in patterns.items()
-        if pattern.pattern not in (radial, tangential)
-    }
 
 
 def _reasons_not_axisymmetric(
@@ -442,54 +432,43 @@ def _reasons_not_axisymmetric(
         yield "a field is not along e3"
     if vectors.by_points and not vectors.by_points.controls.is_axisymmetric:
         yield "the remanence is given at points in space"
-    for name, pattern in _varying_patterns(vectors.patterns).items():
+    for name, pattern in vectors.varying_patterns.items():
         # the pattern of a patch is looked at on the meridian of its shell
         meridian = outline.meridian
         if meridian:
             meridians = [m for m in meridian.shell_meridians if name.startswith(m.name)]
-            meridian = replace(meridian, shell_meridians=tuple(meridians))
+            meridian = replace(
+                meridian, shell_meridians=tuple(meridians), narrow_places=np.zeros((0, 3))
+            )
         field = partial(_at_places, pattern)
-        if not (meridian and field_is_axisymmetric(field, meridian, smooth=False)):
+        if not is_axisymmetric(field, meridian):
             yield f"the remanence of {name} differs around e3"
-    is_axisymmetric = _axisymmetry_of_formulas(magnetic, outline, vectors.sources)
-    for field_in_words, is_field_axisymmetric in is_axisymmetric.items():
-        if not is_field_axisymmetric:
-            yield f"{field_in_words} differs around e3"
+    for field_in_words in _what_differs_around_axis(magnetic, outline, vectors.sources):
+        yield f"{field_in_words} differs around e3"
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         yield "the gradient of the applied field is not diag(a, a, b)"
 
 
-def _axisymmetry_of_formulas(
-    magnetic: MagneticSection, outline: Outline, sources: Sequence[Callable[[Array], Array]]
-) -> dict[str, bool]:
-    """Return description -> whether a formula, or the field of sources, is axisymmetric about e3.
+def _what_differs_around_axis(
+    magnetic: MagneticSection, outline: Outline, sources: Sequence[FieldFunction]
+) -> Iterator[str]:
+    """Yield which formulas, or the field of sources, are not axisymmetric about e3, in words.
 
-    A description is the subject of a message for the user. Only formulas and fields that the case
-    has are listed. Values around the axis are compared at places of the outline's meridian;
-    without a meridian nothing counts as axisymmetric.
+    They are compared at places of the outline's meridian; without a meridian none counts as
+    axisymmetric.
     """
-    meridian = outline.meridian
+    meridian, chi = outline.meridian, magnetic.susceptibility
     remanence = magnetic.remanent.components if magnetic.remanent else None
     applied = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
-    is_axisymmetric = dict[str, bool]()
-    if remanence and not isinstance(remanence, UserField):
-        is_axisymmetric["the formula of the remanence"] = bool(
-            meridian and vector_is_axisymmetric(remanence, meridian)
-        )
-    if applied:
-        is_axisymmetric["the formula of the applied field"] = bool(
-            meridian and vector_is_axisymmetric(applied, meridian, in_space=True)
-        )
-    if isinstance(magnetic.susceptibility, str):
-        is_axisymmetric["the susceptibility"] = bool(
-            meridian and scalar_is_axisymmetric(magnetic.susceptibility, meridian)
-        )
-    if sources:
-        is_axisymmetric["the field of a source"] = bool(
-            meridian and all(field_is_axisymmetric(field, meridian) for field in sources)
-        )
-    return is_axisymmetric
+    if isinstance(remanence, list) and not is_axisymmetric(formula_field(remanence), meridian):
+        yield "the formula of the remanence"
+    if applied and not is_axisymmetric(formula_field(applied), meridian, in_space=True):
+        yield "the formula of the applied field"
+    if isinstance(chi, str) and not is_axisymmetric(formula_field(chi), meridian):
+        yield "the susceptibility"
+    if not all(is_axisymmetric(field, meridian, is_smooth=True) for field in sources):
+        yield "the field of a source"
 
 
 def _at_places(pattern: Pattern, x: Array) -> Array:

@@ -14,7 +14,6 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
-from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.motion.history import (
     History,
@@ -28,8 +27,8 @@ from magshell_fenicsx.parts.step import BALANCE, Step
 from magshell_fenicsx.parts.step_course import Errors, ExpectedEnd, StepEnd
 from magshell_fenicsx.quantities.quantity import Amplitude
 from magshell_fenicsx.quantities.registry import AMPLITUDES, amplitude
-from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
-from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding
+from magshell_fenicsx.shape.field_symmetry import formula_field, is_axisymmetric, is_mirror_image
+from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
@@ -235,20 +234,12 @@ class TimeSection(Step):
         """Return the symmetry that the initial velocity preserves; all without one."""
         if not self.velocity:
             return []
-        initial_velocity, length = vector_function(self.velocity), context.shell.reference
-
-        def keeps(mirror: Mirror) -> bool:
-            """Return whether the initial velocity is mirror symmetric at sampled places."""
-            x = outline.sample()
-            mirrored_velocity = initial_velocity(length * x) @ mirror.reflection
-            return equal_to_rounding(mirrored_velocity, initial_velocity(length * mirror.image(x)))
-
-        is_axisymmetric = outline.meridian and vector_is_axisymmetric(
-            self.velocity, outline.meridian, length
-        )
+        velocity = formula_field(self.velocity, context.shell.reference)
+        is_same_around = is_axisymmetric(velocity, outline.meridian)
         return [
             SymmetryConstraint(
-                None if is_axisymmetric else "the initial velocity differs around e3", (), keeps
+                None if is_same_around else "the initial velocity differs around e3",
+                mirrors=lambda mirror: is_mirror_image(velocity, mirror, outline.sample()),
             )
         ]
 

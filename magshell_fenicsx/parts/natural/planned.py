@@ -21,12 +21,11 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.shell_sections import MeshSurface, PlateSurface, ShellSection
-from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
+from magshell_fenicsx.shape.field_symmetry import formula_field, is_axisymmetric, is_mirror_image
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, unit
 
 Array = NDArray[np.float64]
-EQUALITY_TOLERANCE = 1e-9  # over the largest value: smaller differences are rounding
 MERIDIAN = "meridian"
 
 
@@ -165,7 +164,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     if is_anisotropic(context) and not is_along_meridians:
         return "the natural shape is not along the meridians"
     if outline.meridian and not all(
-        scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts
+        is_axisymmetric(formula_field(text, R), outline.meridian) for text in section.texts
     ):
         return "the natural shape differs around e3"
     return None
@@ -186,14 +185,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
 
     def is_mirrored(text: float | str, sign: float = 1.0) -> bool:
         """Return whether a number or formula has the same values at images, but for the `sign`."""
-        values, values_of_image = (
-            formula_function(text)(*(R * places).T) for places in (x, mirror.image(x))
-        )
-        size = np.abs(values).max(initial=0.0)
-        return bool(
-            np.isfinite(values).all()
-            and (np.abs(values - sign * values_of_image) <= EQUALITY_TOLERANCE * size).all()
-        )
+        return is_mirror_image(formula_field(text, R), mirror, x, sign=sign)
 
     # components that keep their sign: the first two of curvature and stretch; and the twists
     curvatures = _components_of_patches(section.curvature)
@@ -224,19 +216,9 @@ def _is_frame_mirrored(
     # meridians are mirrored by a plane that contains the axis, or is normal to it
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-
-    def directions_at(places: Array) -> Array:
-        """Return the first direction (n, 3), by numbers or formulas, at places (n, 3) over R."""
-        return np.stack([formula_function(v)(*(R * places).T) for v in direction], -1)
-
     # t1 and -t1 are the same frame, as tensors have it
-    directions, directions_at_images = directions_at(x), directions_at(mirror.image(x))
-    mirrored_directions = directions @ mirror.reflection
-    tolerance = EQUALITY_TOLERANCE * np.abs(directions).max()
-    return any(
-        bool((np.abs(mirrored_directions - sign * directions_at_images) <= tolerance).all())
-        for sign in (1, -1)
-    )
+    directions = formula_field(direction, R)
+    return any(is_mirror_image(directions, mirror, x, sign=sign) for sign in (1.0, -1.0))
 
 
 def _components_of_patches(value: object) -> list[list[float | str]]:

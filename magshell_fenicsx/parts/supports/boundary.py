@@ -91,14 +91,6 @@ class BoundarySection(Section, Ability):
         """Return name of each edge, point or patch -> its condition."""
         return dict(self.__pydantic_extra__ or {})
 
-    def warning(self, context: Context, places: Array) -> str | None:
-        """Return a warning if pressure blows up rubber beside a clamped edge; None if not.
-
-        Of several shells each has a warning of its own. `places` are not used here.
-        """
-        is_one_shell = getattr(context.shell, "assembly", None) is None
-        return inflation_warning(context) if is_one_shell else None
-
     def refuse_unfit(self, context: Context) -> None:
         """Refuse names of points that are taken, and of edges that the geometry does not have.
 

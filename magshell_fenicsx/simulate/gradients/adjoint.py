@@ -47,6 +47,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Gas
+from magshell_fenicsx.quantities.mode_labels import waves_of_label
 from magshell_fenicsx.shells.mass import mass_along
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.model_base import ModelBase
@@ -63,7 +64,6 @@ from magshell_fenicsx.simulate.steps import (
 )
 from magshell_fenicsx.simulate.transfer import transfer
 
-WAVE = "m = "  # what the mode of a wave begins with
 CONJUGATE_TOLERANCE = (
     1e-5  # a conjugate is still the one that was held, relative to the larger of it and its unit
 )
@@ -237,8 +237,8 @@ def adjoint_of_instability(
     CaseError
         If the record is another instability, or a conjugate that its step holds has no derivative.
     """
-    if record.mode.startswith(WAVE):
-        return _of_wave(scene, record)
+    if m := waves_of_label(record.mode):
+        return _of_wave(scene, record, m)
     if record.label != "fold":
         raise CaseError(
             f"instability: this is a {record.label} {record.mode}".rstrip()
@@ -266,11 +266,11 @@ def adjoint_of_fold(stage: Stage, fold: Fold) -> Adjoint:
     return Adjoint(stage.scene, [place], value=fold.value, free_amplitude=fold.name)
 
 
-def _of_wave(scene: Scene, record: Record) -> Adjoint:
-    """Return the adjoint of the amplitude at which waves around a meridian are neutral; collective.
+def _of_wave(scene: Scene, record: Record, m: int) -> Adjoint:
+    """Return the adjoint of the amplitude at which m waves around a meridian are neutral.
 
     Q(phi) is the second variation of the neutral wave phi, and dQ/dmu = Q_mu + w . R_mu its total
-    derivative along the path, with the solution w of K w = -Q_u. The derivative of J is
+    derivative along the path, with the solution w of K w = -Q_u. Collective. The derivative of J is
 
         dJ/dp = -(Q_p + w . R_p)/(dQ/dmu).
 
@@ -281,7 +281,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     CaseError
         If the step holds a conjugate, shells touch, or the meridian has a T-junction.
     """
-    model, m = scene.model, int(record.mode.removeprefix(WAVE))
+    model = scene.model
     if record.step and scene.problem.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric

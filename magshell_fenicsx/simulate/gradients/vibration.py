@@ -38,7 +38,8 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.shells.modes import TORSION, ShellMode, ShellModes, mode_space
+from magshell_fenicsx.quantities.mode_labels import waves_of_label
+from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.simulate.contact_control import (
     contact_expanded_about,
     refuse_touching_shells,
@@ -48,7 +49,6 @@ from magshell_fenicsx.simulate.contact_control import (
 )
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NO_BEGINS,
-    WAVE,
     Adjoint,
     AdjointState,
     Begins,
@@ -317,7 +317,7 @@ def _adjoint(
     # where shells touch, differences need fixed places in contact: an expansion about the state
     shells_touch = any(depth > 0 for _, depth in shell_penetrations(scene, state))
     contact_state = state if shells_touch else None
-    if contact_state and _wave_number(vibration.modes[0]) is not None:
+    if contact_state and waves_of_label(vibration.modes[0].label) is not None:
         refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")
     largest_step = MAX_DIFFERENCE_STEP_IN_CONTACT if contact_state else MAX_DIFFERENCE_STEP
     # phi . K phi of each mode, with derivatives by u and by unknown amplitudes; and those of J
@@ -338,7 +338,7 @@ def _adjoint(
     for mode in vibration.modes:
         # in J there is factor (phi . K phi - lambda phi . M phi)
         inertia = -factor * mode.eigenvalue
-        if (m := _wave_number(mode)) is not None:  # its energies are forms of their own
+        if (m := waves_of_label(mode.label)) is not None:  # its energies are forms of their own
             directions.append(EnergyDirection(mode.vector, m, stiffness=factor, inertia=inertia))
             continue
         places += _displaced_places(scene, state, mode, factor, rows, largest_step)
@@ -385,13 +385,6 @@ def _displaced_places(
     return places
 
 
-def _wave_number(mode: ShellMode) -> int | None:
-    """Return the number of waves of a mode around a meridian; 0 of torsion, None of other modes."""
-    if mode.label == TORSION:
-        return 0
-    return int(mode.label.removeprefix(WAVE)) if mode.label.startswith(WAVE) else None
-
-
 def _total_rate(slopes: Iterable[Functional], name: str) -> float:
     """Return the sum of the derivatives of functionals by an amplitude."""
     return sum(slope.by_mu[name] for slope in slopes)
@@ -417,7 +410,7 @@ def _slopes(
         If the mode does not have the model's symmetry, and is no wave.
     """
     system, phi = scene.model.system, mode.vector
-    if (m := _wave_number(mode)) is not None:
+    if (m := waves_of_label(mode.label)) is not None:
         assert scene.model.axisymmetric
         return variation(scene.model, state, phi, m, held_names)
     if mode.label:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.output.pictures.lines import smooth
+from magshell_fenicsx.quantities.mode_labels import WAVES
 from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
 from magshell_fenicsx.studies.figures import add_legend, saved_figure
 from magshell_fenicsx.studies.naming import key_label
@@ -350,4 +351,4 @@ def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
 
 def _mode(mode: str) -> str:
     """Return the words "with m = ..." for a mode of waves around a meridian, else ""."""
-    return f"with {mode}" if mode.startswith("m = ") else ""
+    return f"with {mode}" if mode.startswith(WAVES) else ""

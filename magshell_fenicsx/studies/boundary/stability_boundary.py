@@ -36,11 +36,12 @@ from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.problem.columns import sizes_in_units
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC, wave_label
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow_alone
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.scene_family import WAVES, SceneFamily, first_instability
+from magshell_fenicsx.simulate.scene_family import SceneFamily, first_instability
 from magshell_fenicsx.studies.boundary.journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary.picture import draw_boundary
 from magshell_fenicsx.studies.boundary.start import Start, start_from
@@ -223,7 +224,7 @@ def _begin(
 
     begin = instability("start", start)
     name_of_mode = begin["mode"]
-    if name_of_mode == "antisymmetric":
+    if name_of_mode == ANTISYMMETRIC:
         say("the instability is antisymmetric: the whole shell is modelled")
         override(varied.source, "symmetry=none")
         # the points of the whole shell's history have other numbers
@@ -479,7 +480,7 @@ def _row(
         "key": float(locus.p),
         **_load(family.name, locus.state.mu[family.name], family.problem(locus.p)),
         "kind": label if label in SPECIAL else mode.kind,
-        "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in wave_numbers),
+        "mode": ", ".join(wave_label(m) if m else mode_name for m in wave_numbers),
         "error": float(locus.load_error),
         "unstable": int(unstable),
         "factorisations": int(locus.factorisations),

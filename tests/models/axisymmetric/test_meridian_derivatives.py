@@ -135,6 +135,6 @@ def test_waves_have_every_term_that_is_not_linear() -> None:
         return float(x @ out.array)
 
     whole = form(model.system.tangent(u, FACTORS), v)
-    assert form(
-        model.symmetry_breaking_modes.waves.tangent(State(u, FACTORS), 0), wave
-    ) == pytest.approx(whole / 2, rel=1e-10)
+    assert form(model.waves.tangent(State(u, FACTORS), 0), wave) == pytest.approx(
+        whole / 2, rel=1e-10
+    )

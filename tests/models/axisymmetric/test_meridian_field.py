@@ -35,7 +35,7 @@ def test_on_the_meridian_and_its_waves(law: RemanenceLaw) -> None:
     )
     found = []
     for model in models:
-        waves = model.symmetry_breaking_modes.waves
+        waves = model.waves
         K = [dense(waves.tangent(State(u, mu), 3)) for mu in ({"lambda_m": 0.0}, {"lambda_m": 1.0})]
         loads, energy = (
             model.system.load(u, {}, "lambda_m"),

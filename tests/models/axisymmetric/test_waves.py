@@ -46,7 +46,7 @@ def second_variation(K: Any, v: Array) -> float:
 
 
 def on_the_meridian(model: MeridianModel, m: int, mu: dict[str, float]) -> float:
-    waves = model.symmetry_breaking_modes.waves
+    waves = model.waves
     phi = waves.V.tabulate_dof_coordinates()[:, 0]
     U, V, W = wave(phi, m)
     u = np.column_stack(displacement(model.V.tabulate_dof_coordinates()[:, 0])).ravel()
@@ -115,7 +115,7 @@ def test_agrees_with_the_half_shell(law: RemanenceLaw) -> None:
 def test_rigid_motions_are_neutral() -> None:
     """Of the undeformed shell translation and rotation; of a deformed one translation, exactly."""
     model = hemisphere(20, 0.3, Loads(), condition="free")
-    waves = model.symmetry_breaking_modes.waves
+    waves = model.waves
     rho, z = model.r0.x.array.reshape(-1, 2).T
     zero = 0 * rho
     translation, rotation = (
@@ -136,7 +136,7 @@ def test_known_waves() -> None:
     axisymmetric fold.
     """
     model, found = buckled(300, 0.00184)
-    waves = model.symmetry_breaking_modes.waves
+    waves = model.waves
     first = crossings(model, found)[0]
     m, point = int(first.label.removeprefix("m = ")), first.point
     assert m == 28
@@ -171,7 +171,7 @@ def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
 def test_counts_of_all_waves_are_those_of_each(R_over_h: float, lambda_m: float) -> None:
     """Interpolated between five m, as a polynomial of degree 4; 13 are unstable at one fold."""
     model, found = buckled(R_over_h, lambda_m)
-    waves, state = model.symmetry_breaking_modes.waves, found.instability.point.state
+    waves, state = model.waves, found.instability.point.state
     counts = waves.counts(state)
     assert {m: count for m, count in enumerate(counts, 1) if count} == waves.unstable(state)
     assert sum(counts) == (13 if R_over_h == 300 else 0)
