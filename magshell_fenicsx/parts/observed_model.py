@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.law import Law
     from magshell_fenicsx.models.shell.parameters import Material
     from magshell_fenicsx.parts.bodies.body_contact import BodyContact, Region
-    from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
-    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+    from magshell_fenicsx.parts.contact.pair_contact import PairContact
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.parts.supports.support_motion import Support
 
@@ -72,7 +71,7 @@ class ObservedModel(Protocol):
     contacts: "dict[str, tuple[BodyContact, Mapping[str, fem.Form]]]"
 
     @property
-    def shell_contacts(self) -> "Sequence[SurfaceContact] | Sequence[MeridianContact]":
+    def shell_contacts(self) -> "Sequence[PairContact[Any]]":
         """The contacts of parts of the shell with each other, or with itself."""
 
     @property

@@ -366,11 +366,8 @@ class MeridianModel(ThinModel):
             parameters |= self.growing.parameters(terms, parameters)
         edge_pressure = self._edge_pressure() if is_enclosed else None
         motion = moving(self.r0, self.supports, loads, edge_pressure)
-        # numbers that a state keeps, such as penalty stiffnesses: name -> constant and default
-        histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
         self.shell_contacts = self._make_shell_contacts()
         for contact in self.shell_contacts:
-            histories |= contact.history
             # parameters that change a contact too, such as the thickness of a natural shape
             parameters |= contact.entered(parameters)
         self.t_junction_terms = self._make_t_junctions()
@@ -382,7 +379,7 @@ class MeridianModel(ThinModel):
             self.held.axisymmetric_conditions(self.V),
             pattern_term,
             self.material.h,
-            variables=SystemVariables(parameters, motion, histories),
+            variables=SystemVariables(parameters, motion, self.contact_history),
         )
         self._volume = volume_request()
         self._probe_by_point = {

@@ -36,13 +36,13 @@ from magshell_fenicsx.parts.bodies.body_contact import BodyContact, Region
 from magshell_fenicsx.parts.forces.load_vectors import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.penalty_contact import PenaltyContact
 from magshell_fenicsx.parts.supports.support_motion import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
-    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+    from magshell_fenicsx.parts.contact.pair_contact import PairContact
 
 Array = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ class ModelBase:
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
     contacts: dict[str, tuple[BodyContact, Mapping[str, fem.Form]]]
-    shell_contacts: "Sequence[SurfaceContact] | Sequence[MeridianContact]" = ()
+    shell_contacts: "Sequence[PairContact[Any]]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
     growing: PlacementAmplitudes | None = None
@@ -258,23 +258,32 @@ class ModelBase:
         mean_radius = moment / pressure if pressure else 0.0
         return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
 
+    @property
+    def all_contacts(self) -> list[PenaltyContact[Any, Any]]:
+        """All contacts: with bodies, then of parts of the shell."""
+        return [*(body_contact for body_contact, _ in self.contacts.values()), *self.shell_contacts]
+
+    @property
+    def contact_history(self) -> dict[str, tuple[Any, float]]:
+        """The numbers of contacts that a state keeps, with defaults: stiffnesses and cuts."""
+        history = dict[str, tuple[Any, float]]()
+        for contact in self.all_contacts:
+            history |= contact.history
+        return history
+
     def cell_pressures(self, state: State) -> Array | None:
         """Return the sum of all contact pressures in each local cell, (cells,), over E h/R.
 
         A cell has the mean pressure of each contact with a body, or of parts of the shell. None
         without contacts.
         """
-        if not (self.contacts or self.shell_contacts):
+        contacts = self.all_contacts
+        if not contacts:
             return None
-        body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def pressure_of_cells() -> Array:
             """Return the sum over all contacts in each cell, at the system's state."""
-            pressures = [body_contact.cell_pressures() for body_contact in body_contacts]
-            for contact in self.shell_contacts:
-                cell_pressures, _, _ = contact.cell_pressures_and_gaps()
-                pressures.append(cell_pressures)
-            return np.asarray(sum(pressures))
+            return np.asarray(sum(contact.cell_pressures() for contact in contacts))
 
         return self.system.at_state(state).evaluate(pressure_of_cells)
 
@@ -283,14 +292,10 @@ class ModelBase:
 
         There the mean over the cell, as `cell_pressures` gives it, stands for the pressure.
         """
-        body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
             """Return whether any contact presses each cell evenly, at the system's state."""
-            flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
-            for contact in self.shell_contacts:
-                _, _, is_evenly_pressed = contact.cell_pressures_and_gaps()
-                flags.append(is_evenly_pressed)
+            flags = [contact.evenly_pressed() for contact in self.all_contacts]
             return np.asarray(np.any(flags, axis=0))
 
         return self.system.at_state(state).evaluate(flags_of_cells)

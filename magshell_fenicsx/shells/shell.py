@@ -15,7 +15,7 @@ error on every rank.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import ufl
@@ -93,7 +93,7 @@ from magshell_fenicsx.shells.sector_modes import SectorModes
 from magshell_fenicsx.shells.shell_supports import ShellSupports
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+    from magshell_fenicsx.parts.contact.pair_contact import PairContact
     from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 
 
@@ -467,7 +467,7 @@ class ShellModel(ThinModel):
             terms += [self.factory.term(energy) for energy in energies]
         return terms
 
-    def _make_shell_contacts(self) -> "Sequence[SurfaceContact]":
+    def _make_shell_contacts(self) -> "Sequence[PairContact[Any]]":
         """Return the contacts between parts of the shell, as terms; empty without contact pairs."""
         if not self.loads.pairs:
             return ()
@@ -557,10 +557,6 @@ class ShellModel(ThinModel):
             if not (self.growing and term.amplitude == "pressure"):
                 term.points = residual
         parameters = self._free_parameters(terms, density_terms, residual)
-        # numbers that a state keeps, such as penalty stiffnesses: name -> constant and default
-        histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
-        for contact in self.shell_contacts:
-            histories |= contact.history
         return FiniteElementSystem(
             self.u,
             terms,
@@ -569,7 +565,7 @@ class ShellModel(ThinModel):
             self.material.h,
             tangent,
             residual,
-            SystemVariables(parameters, self.moving, histories),
+            SystemVariables(parameters, self.moving, self.contact_history),
         )
 
     def _point_residual(

@@ -18,7 +18,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import ceil, comb, sqrt
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import ufl
@@ -31,7 +31,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.nonlocal_terms import with_entries
+from magshell_fenicsx.assembly.nonlocal_terms import Entries, with_entries
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
@@ -40,15 +40,18 @@ from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.wave_hessians import WaveHessians
 from magshell_fenicsx.models.domains import Energy, IntegrationDomain
-from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.quantities.mode_labels import wave_label
 
-if TYPE_CHECKING:
-    from magshell_fenicsx.shells.t_junctions import MeridianTJunction
-
 Array = NDArray[np.float64]
 DEGREE = 4  # degree in m of a wave's matrix, which five values of m determine
+
+
+class NonlocalWaveTerm(Protocol):
+    """A term that couples places of a meridian that are apart: a contact, or a T-junction."""
+
+    def entries_of_waves(self, m: float) -> Entries:
+        """Return the entries of its second variation along waves of m theta, as `Waves` has it."""
 
 
 class Waves:
@@ -114,7 +117,7 @@ class Waves:
         domain: IntegrationDomain,
         supports: Supports,
         log: KernelLog,
-        nonlocal_terms: "Sequence[MeridianContact | MeridianTJunction]" = (),
+        nonlocal_terms: Sequence[NonlocalWaveTerm] = (),
     ) -> None:
         """Make the space of waves and the Hessians of the energies; parameters are the class's."""
         self.nonlocal_terms = nonlocal_terms

@@ -22,7 +22,7 @@ Words and symbols:
 - h and R are thickness and reference length.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -38,11 +38,10 @@ from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
-from magshell_fenicsx.parts.contact.contact_section import Pair
-from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+from magshell_fenicsx.parts.penalty_contact import PenaltyOptions
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.simulate.contact_onset import CONTACT_DEPTH, gathered_displacement
+from magshell_fenicsx.simulate.contact_onset import CONTACT_DEPTH
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -54,17 +53,11 @@ MAX_APPROACHES = 1000  # approaches by the least gap
 RETURN_DISTANCE = 0.1  # of h: how far a path that returns is from its turn
 RETURN_TOLERANCE = 0.02  # of that: how far it is from the way there
 STIFFENING = 4.0  # how much stiffer a contact becomes at once
-MAX_STIFFENING = 1e4  # how much stiffer a body becomes at most
-# how much stiffer a shell becomes at most: the point of a corner has a small weight
-MAX_STIFFENING_OF_SHELLS = 1e6
-# of the bound, at points: between them, with other cuts, shells may be deeper
-BOUND_AT_POINTS = 0.75
 # of a critical mode's stiffness: what closer points of contact may change of it
 CERTAIN_STIFFNESS_CHANGE = 0.5
 HALVINGS_BEFORE_PASSING = 8  # halvings of a way on which shells would pass through each other
 # of h: the penetration that shells which hit each other flat are meant to have
 IMPACT_PENETRATION = 0.03
-IMPACT_BOUND_RATIO = 100.0  # times the bound: a penetration that lasts for a moment
 SAMPLES_OF_MOTION = 65  # places of supports on their way at which shells are compared
 HALVINGS_OF_MOTION = 30  # halvings of the part of the way in which shells meet
 RIGID_RATIO = 2.0  # displacement over penetration below which a body is rigid enough
@@ -129,30 +122,21 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
     A contact is too deep if it penetrates more than its bound at this state. A stiffness that the
     case gives stays, and so does one at its upper limit. Collective.
     """
-    h, settings = scene.problem.material.h, dict[str, float]()
-    # bodies on the shell; a contact that was never changed has no setting in the state
-    for contact in scene.problem.loads.contacts:
-        stiffness = state.mu.get(contact.setting, contact.stiffness)
-        depth = scene.model.region(state, contact.amplitude).penetration  # over R
-        is_too_deep = depth > contact.max_penetration * h
-        is_below_limit = stiffness < MAX_STIFFENING * contact.stiffness
-        may_rise = is_below_limit and not contact.has_given_stiffness
+    settings, evaluation = dict[str, float](), scene.model.system.at_state(state)
+    for contact in scene.model.all_contacts:
+        penalty = contact.options
+        # a stiffness that was never changed has no setting in the state
+        stiffness = state.mu.get(penalty.setting, penalty.stiffness)
+        depth = evaluation.evaluate(contact.relative_penetration)
+        is_too_deep = depth > contact.bound_at_points * penalty.max_penetration
+        is_below_limit = stiffness < contact.max_stiffening * penalty.stiffness
+        may_rise = is_below_limit and not penalty.has_given_stiffness
         if is_too_deep and may_rise:
-            settings[contact.setting] = STIFFENING * stiffness
-    # shells on each other
-    for pair, depth in shell_penetrations(scene, state):  # depth over the thickness
-        stiffness = state.mu.get(pair.setting, pair.stiffness)
-        # depths are those at points of contact; between these shells may be deeper, so that only
-        # a part of the bound is allowed
-        is_too_deep = depth > BOUND_AT_POINTS * pair.max_penetration
-        is_below_limit = stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
-        may_rise = is_below_limit and not pair.has_given_stiffness
-        if is_too_deep and may_rise:
-            settings[pair.setting] = STIFFENING * stiffness
+            settings[penalty.setting] = STIFFENING * stiffness
     return settings
 
 
-def stiff_for(pair: Pair, speed: float, h: float) -> float:
+def stiff_for(pair: PenaltyOptions, speed: float, h: float) -> float:
     """Return a stiffness with which shells that hit each other flat penetrate little enough.
 
     At the penetration s of `IMPACT_PENETRATION` h the penalty has taken all kinetic energy of the
@@ -163,7 +147,7 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
     Parameters
     ----------
     pair
-        Two shells that may touch.
+        The penalty of two shells that may touch.
     speed
         Their relative speed over that of waves.
     h
@@ -207,13 +191,7 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     empty. Collective.
     """
     scene, state = stage.scene, stage.leave(high.state)
-    evaluation = scene.model.system.at_state(state)
-    # number of the finer cuts; None where the contact has no finer ones
-    numbers = {
-        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.finer_cuts)
-        for shell_contact in _surface_contacts(scene)
-    }
-    closer = {name: number for name, number in numbers.items() if number is not None}
+    closer = _numbers_of_cuts(scene, state, SurfaceContact.finer_cuts)
     # the instability is certain if closer points hardly change the modes beside it
     is_certain = not closer or all(_has_certain_mode(stage, point, closer) for point in (high, low))
     return {} if is_certain else closer
@@ -252,13 +230,7 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
     As shells slide on each other, segments of old cuts no longer face one cell each, and the
     quadrature becomes less exact. Collective.
     """
-    evaluation = scene.model.system.at_state(state)
-    # number of cuts made at this state; None where these are not much better
-    numbers = {
-        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.improved_cuts)
-        for shell_contact in _surface_contacts(scene)
-    }
-    return {name: number for name, number in numbers.items() if number is not None}
+    return _numbers_of_cuts(scene, state, SurfaceContact.improved_cuts)
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
@@ -266,12 +238,23 @@ def with_cuts_here(scene: Scene, state: State) -> State:
 
     Cuts belong to the mesh of a model, so numbers of another one mean nothing here.
     """
-    evaluation = scene.model.system.at_state(state)
-    numbers = {
-        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.present_cuts)
-        for shell_contact in _surface_contacts(scene)
-    }
+    numbers = _numbers_of_cuts(scene, state, SurfaceContact.present_cuts)
     return State(state.u, {**state.mu, **numbers})
+
+
+def _numbers_of_cuts(
+    scene: Scene, state: State, make_cuts: Callable[[SurfaceContact], float | None]
+) -> dict[str, float]:
+    """Return setting of a pair's cuts -> number of cuts that are made at a state; collective.
+
+    Pairs for which none are made, where `make_cuts` returns None, are left out.
+    """
+    evaluation, numbers = scene.model.system.at_state(state), dict[str, float]()
+    for shell_contact in _surface_contacts(scene):
+        number = evaluation.evaluate(partial(make_cuts, shell_contact))
+        if number is not None:
+            numbers[shell_contact.pair.cuts] = number
+    return numbers
 
 
 def _surface_contacts(scene: Scene) -> list[SurfaceContact]:
@@ -300,13 +283,13 @@ def with_own_contact(scene: Scene, state: State) -> State | None:
     return State(state.u, {**state.mu, **changed}) if changed else None
 
 
-def shell_penetrations(scene: Scene, state: State) -> list[tuple[Pair, float]]:
-    """Return pairs of shells that may touch, each with penetration over thickness; collective."""
+def touching_shells(scene: Scene, state: State) -> str:
+    """Return words for the first pair of shells that touch at a state; "" if none; collective."""
     evaluation = scene.model.system.at_state(state)
-    return [
-        (shell_contact.pair, evaluation.evaluate(shell_contact.relative_penetration))
-        for shell_contact in scene.model.shell_contacts
-    ]
+    for shell_contact in scene.model.shell_contacts:
+        if evaluation.evaluate(shell_contact.penetration) > 0:
+            return shell_contact.pair.words
+    return ""
 
 
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
@@ -329,19 +312,17 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
     model = stage.scene.model
     if not model.shell_contacts:
         return
-    if model.axisymmetric:
-        displacements_of_meridian = [  # of all nodes, (n, 2)
-            model.system.with_ghosts(model_state.u, model_state.mu).reshape(-1, 2)
-            for model_state in map(stage.leave, (low.state, high.state))
-        ]
-        _refuse_through(model.shell_contacts, displacements_of_meridian)
-        return
-    end = stage.leave(high.state)
-    displacements = [  # of all ranks' nodes
-        gathered_displacement(stage.scene, state) for state in (stage.leave(low.state), end)
-    ]
-    _refuse_touching_mirror_image(stage.scene, end, low)
-    _refuse_through(_surface_contacts(stage.scene), displacements)
+    begin, end = (stage.leave(point.state) for point in (low, high))
+    if not model.axisymmetric:
+        _refuse_touching_mirror_image(stage.scene, end, low)
+    evaluations = [model.system.at_state(state) for state in (begin, end)]
+    for shell_contact in model.shell_contacts:
+        configuration = partial(getattr, shell_contact, "configuration")
+        ends = [evaluation.evaluate(configuration) for evaluation in evaluations]
+        if shell_contact.passes_through(*ends):
+            raise StepTooLong(
+                f"the shortest step passes {shell_contact.pair.words} through each other"
+            )
 
 
 def _refuse_touching_mirror_image(scene: Scene, end: State, low: Point) -> None:
@@ -408,30 +389,6 @@ def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
     except (StepTooLong, PathStopped):
         return True
     return False
-
-
-def _refuse_through(
-    shell_contacts: Sequence[SurfaceContact] | Sequence[MeridianContact],
-    ends: Sequence[NDArray[np.float64]],
-) -> None:
-    """Check that no shell passes through another one on the straight way between two displacements.
-
-    Parameters
-    ----------
-    ends
-        Displacements over R at the two ends, as `passes_through` of the contacts takes them: of all
-        nodes of a surface, or (n, 2) of a meridian.
-
-    Raises
-    ------
-    StepTooLong
-        With the shells that pass.
-    """
-    for shell_contact in shell_contacts:
-        if shell_contact.passes_through(*ends):
-            raise StepTooLong(
-                f"the shortest step passes {shell_contact.pair.words} through each other"
-            )
 
 
 def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
@@ -575,32 +532,14 @@ def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> 
     Parameters
     ----------
     moving
-        Whether the state is one of a motion, where shells may hit each other: then the bound
-        between shells is `IMPACT_BOUND_RATIO` times as large.
+        Whether the state is one of a motion, where shells may hit each other and penetrate more.
     """
-    h = scene.problem.material.h
-    # depths are over h
-    for contact in scene.problem.loads.contacts:
-        depth = scene.model.region(state, contact.amplitude).penetration / h
-        if depth > contact.max_penetration:
-            stiffness = state.mu.get(contact.setting, contact.stiffness)
-            return (
-                f"the penetration of the body {contact.body} is {depth:.3g} h, more than "
-                f"bodies.{contact.body}.penetration: {contact.max_penetration:g}; its stiffness is "
-                f"{stiffness:.4g}: give four times as much"
-            )
-    for pair, depth in shell_penetrations(scene, state):
-        bound = pair.max_penetration * (IMPACT_BOUND_RATIO if moving else 1.0)
-        if depth > bound:
-            finding = (
-                f"the penetration between {pair.words} is {depth:.3g} h, more than {bound:g} h"
-            )
-            stiffness = state.mu.get(pair.setting, pair.stiffness)
-            if moving or pair.has_given_stiffness:
-                return f"{finding}; contact: stiffness: is {stiffness:.4g}: give four times as much"
-            return (
-                f"{finding} even with the stiffest penalty: take smaller elements where they touch"
-            )
+    evaluation = scene.model.system.at_state(state)
+    for contact in scene.model.all_contacts:
+        stiffness = state.mu.get(contact.options.setting, contact.options.stiffness)
+        find_message = partial(contact.penetration_message, stiffness, moving=moving)
+        if message := evaluation.evaluate(find_message):
+            return message
     return ""
 
 
@@ -668,23 +607,22 @@ def _overlapping_shells(scene: Scene, state: State, nodes: NDArray[np.int64]) ->
 
     Shells overlap if their penetration exceeds the pair's bound. `nodes` have global numbers.
     """
-    system, components = scene.model.system, 2 if scene.model.axisymmetric else 3
-    own_displacement = system.with_ghosts(state.u, state.mu)[: system.size]
-    u = np.concatenate(system.comm.allgather(own_displacement)).reshape(-1, components)
+    evaluation = scene.model.system.at_state(state)
     for shell_contact in scene.model.shell_contacts:
         largest_overlap = shell_contact.pair.max_penetration * scene.problem.material.h
-        if shell_contact.gap_at_supports(nodes, u) < -largest_overlap:
+        gap = evaluation.evaluate(partial(shell_contact.gap_at_supports, nodes))
+        if gap < -largest_overlap:
             return shell_contact.pair.words
     return ""
 
 
 def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
     """Return the contacts of the bodies that penetrate the shell at a state; collective."""
-    contacts = scene.problem.loads.contacts
+    evaluation = scene.model.system.at_state(state)
     return [
-        contact
-        for contact in contacts
-        if scene.model.region(state, contact.amplitude).penetration > 0
+        body_contact.contact
+        for body_contact, _ in scene.model.contacts.values()
+        if evaluation.evaluate(body_contact.penetration) > 0
     ]
 
 
@@ -704,12 +642,11 @@ def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
     CaseError
         With the shells that touch.
     """
-    for pair, penetration in shell_penetrations(scene, state):
-        if penetration > 0:
-            raise CaseError(
-                f"{result}: has no gradient where shells touch ({pair.words}): take symmetry: "
-                "half, where a wave is a mode as others are, or differences of runs"
-            )
+    if words := touching_shells(scene, state):
+        raise CaseError(
+            f"{result}: has no gradient where shells touch ({words}): take symmetry: half, where a "
+            "wave is a mode as others are, or differences of runs"
+        )
 
 
 @contextmanager

@@ -10,19 +10,13 @@ faces, negative where they overlap.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-
-import numpy as np
-from mpi4py import MPI
-from numpy.typing import NDArray
+from functools import partial
 
 from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.bodies.body_contact import BodyContact
-from magshell_fenicsx.parts.contact.surface_contact import CROSSING_DISTANCE, SurfaceContact
+from magshell_fenicsx.parts.penalty_contact import GapAlongStep
 from magshell_fenicsx.simulate.scene import Scene
 
-Array = NDArray[np.float64]
 # of the thickness: how far before and past the first contact the predictions of two steps lead
 CONTACT_DEPTH = 2e-3
 NEAR_CONTACT = 4.0  # of `CONTACT_DEPTH`: from so near a step leads past the first contact
@@ -48,21 +42,13 @@ def first_contact(
     """
     states, h = (leave(here), leave(prediction)), scene.problem.material.h
     at_begin, at_end = map(scene.model.system.at_state, states)
-    # contacts of surfaces alone: steps on which meridians meet do without this
-    surface_contacts = [
-        contact for contact in scene.model.shell_contacts if isinstance(contact, SurfaceContact)
-    ]
-    body_contacts = [contact for contact, _ in scene.model.contacts.values()]
-    contacts: list[BodyContact | SurfaceContact] = [*body_contacts, *surface_contacts]
-    if surface_contacts:
-        begin_displacement, end_displacement = (
-            gathered_displacement(scene, state) for state in states
-        )
     # part of the way at which the step ends, and whether this is behind a contact
     first_event = 1.0, False
     # shells may lie anywhere in each other
     loses_forces, is_deep = False, bool(scene.model.shell_contacts)
-    for contact in contacts:
+    for contact in scene.model.all_contacts:
+        if not contact.ends_steps:
+            continue
         depth = at_begin.evaluate(contact.penetration)
         if depth:  # it touches already: does it come apart?
             depth_at_end = at_end.evaluate(contact.penetration)
@@ -70,11 +56,9 @@ def first_contact(
             is_deep |= depth_at_end > DEEP_RATIO * depth
             continue
         # it is open: where does it close?
-        if isinstance(contact, SurfaceContact):
-            gap_along_step = _gap_between_surfaces(contact, begin_displacement, end_displacement)
-        else:
-            places = at_begin.evaluate(contact.places), at_end.evaluate(contact.places)
-            gap_along_step = _gap_beside_body(contact, *places, CROSSING_DISTANCE * h)
+        configuration = partial(getattr, contact, "configuration")
+        ends = at_begin.evaluate(configuration), at_end.evaluate(configuration)
+        gap_along_step = contact.gap_along_step(*ends)
         onset = _onset(gap_along_step, CONTACT_DEPTH * h) if gap_along_step else (1.0, False)
         # the earliest; of equal ones that behind a contact
         first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
@@ -82,70 +66,7 @@ def first_contact(
     return StepEvent(part, is_behind, loses_forces, is_deep or is_behind)
 
 
-@dataclass(frozen=True)
-class _GapAlongStep:
-    """The gap of one contact on the straight way of a step; lengths are over R.
-
-    Attributes
-    ----------
-    gap
-        Part of the way -> least gap there; collective.
-    largest_approach
-        Upper bound of the distance by which the gap closes on the whole way.
-    crossing_distance
-        Overlap up to which no face has passed through another one, or through a body.
-    """
-
-    gap: Callable[[float], float]
-    largest_approach: float
-    crossing_distance: float
-
-
-def _gap_between_surfaces(contact: SurfaceContact, u: Array, v: Array) -> _GapAlongStep | None:
-    """Return the gap between two displacements (nodes, 3) of all ranks; None if shells stay apart.
-
-    Collective.
-    """
-    # two nodes come nearer to each other by at most twice the largest displacement
-    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())
-    if not largest_approach or not contact.come_near(u, v):
-        return None
-
-    def gap(part: float) -> float:
-        """Return the least gap after a part of the way."""
-        return contact.gap(u + part * (v - u))
-
-    return _GapAlongStep(gap, largest_approach, CROSSING_DISTANCE * contact.least_thickness())
-
-
-def _gap_beside_body(
-    contact: BodyContact, x: Array, y: Array, crossing_distance: float
-) -> _GapAlongStep | None:
-    """Return the gap between places (points, 3) relative to a body; None if nothing moves.
-
-    The places are those of quadrature points of this rank. Collective.
-    """
-    largest_approach = contact.comm.allreduce(
-        float(np.linalg.norm(y - x, axis=1).max(initial=0.0)), MPI.MAX
-    )
-
-    def gap(part: float) -> float:
-        """Return the least gap after a part of the way."""
-        return contact.least_gap(x + part * (y - x))
-
-    return _GapAlongStep(gap, largest_approach, crossing_distance) if largest_approach else None
-
-
-def gathered_displacement(scene: Scene, state: State) -> Array:
-    """Return the displacement (nodes, 3) of all ranks' nodes, over R; collective."""
-    system = scene.model.system
-    displacements_of_ranks = scene.comm.allgather(
-        system.with_ghosts(state.u, state.mu)[: system.size]
-    )
-    return np.asarray(np.concatenate(displacements_of_ranks).reshape(-1, 3))
-
-
-def _onset(gap_along_step: _GapAlongStep, depth: float) -> tuple[float, bool]:
+def _onset(gap_along_step: GapAlongStep, depth: float) -> tuple[float, bool]:
     """Return where a step on a way ends for a contact that is open; collective.
 
     The gap is evaluated on the way, first in steps so short that no face passes through another

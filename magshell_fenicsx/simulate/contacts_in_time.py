@@ -3,41 +3,18 @@
 Their forces are averaged along a step so that it conserves energy (docs/theory.md, time).
 
 An approach is the amplitude that moves a rigid body, by name in `State.mu`. A setting is the entry
-of `State.mu` with the stiffness of contact between a pair of shells. A contact force follows from
-its arguments, the places of what touches at a state. A sample is a displacement within the step at
-which a contact force is taken.
+of `State.mu` with the stiffness of contact between a pair of shells. A configuration is what the
+force of a contact depends on at a state.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
-from magshell_fenicsx.parts.bodies.body_contact import BodyContact
-from magshell_fenicsx.parts.contact.time_averaging import TimeAveragedContact, samples_of_step
+from magshell_fenicsx.shells.model_base import ModelBase
 from magshell_fenicsx.simulate.contact_control import stiff_for
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _ContactPlaces:
-    """Arguments of contact forces at one end of a step in time.
-
-    Attributes
-    ----------
-    bodies
-        For each body the relative displacements of the points on which it presses, and their
-        factors of the thickness.
-    shells
-        For each contact between shells the displacement of the shells that may touch.
-    """
-
-    bodies: list[tuple[Array, float | Array]]
-    shells: list[Array]
 
 
 class ContactsInTime:
@@ -47,10 +24,8 @@ class ContactsInTime:
 
     Parameters
     ----------
-    body_contacts
-        Name of an approach -> the contact of its body.
-    shell_contacts
-        Contacts between shells.
+    model
+        The model, with its contacts.
 
     Attributes
     ----------
@@ -58,24 +33,19 @@ class ContactsInTime:
         The approaches.
     settings
         Names of the stiffnesses between shells.
-    _system, _body_contacts, _shell_contacts
-        The system; and the contacts of bodies and between shells, each as a sequence.
+    _system, _contacts, _shell_contacts
+        The system; all contacts, and those between shells.
     _begin
-        Displacement at the begin of the present step, and the arguments of contact forces there.
+        Displacement at the begin of the present step, and the configurations of all contacts there.
     """
 
-    def __init__(
-        self,
-        system: FiniteElementSystem,
-        body_contacts: Mapping[str, BodyContact],
-        shell_contacts: Sequence[TimeAveragedContact],
-    ) -> None:
+    def __init__(self, model: ModelBase) -> None:
         """Take the contacts; nothing is computed before the first step."""
-        self._system, self._shell_contacts = system, shell_contacts
-        self._body_contacts = list(body_contacts.values())
-        self.names = frozenset(body_contacts)
-        self.settings = frozenset(contact.pair.setting for contact in shell_contacts)
-        self._begin: tuple[Vector, _ContactPlaces] | None = None
+        self._system = model.system
+        self._contacts, self._shell_contacts = model.all_contacts, model.shell_contacts
+        self.names = frozenset(model.contacts)
+        self.settings = frozenset(contact.pair.setting for contact in model.shell_contacts)
+        self._begin: tuple[Vector, Sequence[Any]] | None = None
 
     def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
         """Return setting -> stiffness of pairs of shells that may meet too fast for their penalty.
@@ -119,33 +89,22 @@ class ContactsInTime:
         part
             Position within the step, from 0 to 1, at which the system takes its forces.
         """
-        places_before, places_after = self._at_begin(begin), self._places(end)
-        for body_contact, place_before, place_after in zip(
-            self._body_contacts, places_before.bodies, places_after.bodies, strict=True
-        ):
-            body_contact.average(place_before, place_after, part)
-        for contact, displacement_before, displacement_after in zip(
-            self._shell_contacts, places_before.shells, places_after.shells, strict=True
-        ):
-            contact.samples = ()  # old ones must not be in use while new ones are computed
-            contact.samples = samples_of_step(
-                contact, displacement_before, displacement_after, part
-            )
+        ends = zip(self._at_begin(begin), self._configurations(end), strict=True)
+        for contact, (before, after) in zip(self._contacts, ends, strict=True):
+            contact.average(before, after, part)
 
     def use_state_forces(self) -> None:
         """Let contact forces be those of the present state again."""
-        for body_contact in self._body_contacts:
-            body_contact.use_present_forces()
-        for contact in self._shell_contacts:
-            contact.samples = ()  # without samples it takes the force of the present state
+        for contact in self._contacts:
+            contact.use_present_force()
 
     def penetration_message(self, begin: State, end: State) -> str:
         """Return which shells pass through each other in a step, in words; "" if none do."""
-        displacements = zip(self._at_begin(begin).shells, self._places(end).shells, strict=True)
-        for contact, (places_before, places_after) in zip(
-            self._shell_contacts, displacements, strict=True
-        ):
-            if contact.images_pass_through(places_before, places_after):
+        ends = [*zip(self._at_begin(begin), self._configurations(end), strict=True)]
+        # contacts between shells come last
+        ends_of_shells = ends[len(ends) - len(self._shell_contacts) :]
+        for contact, (before, after) in zip(self._shell_contacts, ends_of_shells, strict=True):
+            if contact.passes_through(before, after):
                 return f"{contact.pair.words} pass through each other"
         return ""
 
@@ -154,19 +113,16 @@ class ContactsInTime:
         self.use_state_forces()
         return self._system.stored_energy(u, mu)
 
-    def _at_begin(self, begin: State) -> _ContactPlaces:
-        """Return the arguments of contact forces at the begin of a step, computed once."""
+    def _at_begin(self, begin: State) -> Sequence[Any]:
+        """Return the configurations at the begin of a step, computed once."""
         # the displacement is compared by identity of the array
         if self._begin is None or self._begin[0] is not begin.u:
-            self._begin = begin.u, self._places(begin)
-        _, places = self._begin
-        return places
+            self._begin = begin.u, self._configurations(begin)
+        _, configurations = self._begin
+        return configurations
 
-    def _places(self, state: State) -> _ContactPlaces:
-        """Return the arguments of contact forces at a state."""
+    def _configurations(self, state: State) -> Sequence[Any]:
+        """Return what the force of each contact depends on at a state."""
         return self._system.at_state(state).evaluate(
-            lambda: _ContactPlaces(
-                [contact.point_state for contact in self._body_contacts],
-                [contact.displacement for contact in self._shell_contacts],
-            )
+            lambda: [contact.configuration for contact in self._contacts]
         )

@@ -222,7 +222,7 @@ class _Checks:
         Collective.
         """
         scene = self._stage.scene
-        if not (scene.model.contacts or scene.model.shell_contacts):
+        if not scene.model.all_contacts:
             return ""
 
         def message_of_point() -> RecordedValues:

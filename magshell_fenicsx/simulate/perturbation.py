@@ -8,7 +8,7 @@ A key is the path of a number in the case's file, such as "magnetic.remanent.pol
 part of the file. Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from functools import partial
 from typing import Any
 
@@ -266,8 +266,7 @@ def expand_contact(scene: Scene, other: Scene, state: State) -> None:
     # the same body in both scenes
     for name, (body_contact, _) in scene.model.contacts.items():
         other_contact, _ = other.model.contacts[name]
-        gap_at_state = evaluation.evaluate(partial(getattr, body_contact, "gap"))
-        other_contact.expand_about(gap_at_state)
+        other_contact.expand_about(evaluation.evaluate(body_contact.freeze))
 
 
 def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
@@ -280,9 +279,9 @@ def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
         "contact is given by numbers of cells"
     )
     evaluation = scene.model.system.at_state(state)
-    contacts: Sequence[Any] = scene.model.shell_contacts
-    other_contacts: Sequence[Any] = other.model.shell_contacts
-    for shell_contact, other_contact in zip(contacts, other_contacts, strict=True):
+    for shell_contact, other_contact in zip(
+        scene.model.shell_contacts, other.model.shell_contacts, strict=True
+    ):
         if shell_contact.held:  # the expansion that takes its place
             other_contact.hold(shell_contact.held)
         else:

@@ -259,10 +259,8 @@ class Scene:
 
     def _newton_options(self) -> NewtonOptions | None:
         """Return the options of the solver of a model with contact; None (the default) without."""
-        pairs = [contact.pair for contact in self.model.shell_contacts]
-        bodies = self.problem.loads.contacts
-        stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
-        stiffnesses |= {contact.setting: contact.stiffness for contact in bodies}
+        penalties = [contact.options for contact in self.model.all_contacts]
+        stiffnesses = {penalty.setting: penalty.stiffness for penalty in penalties}
         if not stiffnesses:
             return None
         # A penetration changes over far less than h. So factors of a near-by state are of no use.

@@ -305,7 +305,7 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
     # solids, and models with contacts or dead loads, are always built anew
     if not model.thin or old.loads.dead:
         return False
-    if model.contacts or model.shell_contacts:
+    if model.all_contacts:
         return False
     if _symmetry(problem) != _symmetry(old) or _kinds_of_fields(problem) != _kinds_of_fields(old):
         return False

@@ -128,7 +128,7 @@ class Stage:
         scene = self.scene
         arguments = self.newton, name, control, options, scale, scene.journal, scene.progress
         # steps end where shells, or a shell and a body, first touch
-        if scene.model.shell_contacts or scene.model.contacts:
+        if scene.model.all_contacts:
             return Path(*arguments, partial(first_contact, scene, self.leave))
         return Path(*arguments)
 

@@ -184,7 +184,7 @@ def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Driv
         path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     if course.finer:
         path = path.with_step_options(course.finer(path.options))
-    if scene.model.shell_contacts or scene.model.contacts:
+    if scene.model.all_contacts:
         path = path.with_step_options(along_contact(path.options))
     return path
 

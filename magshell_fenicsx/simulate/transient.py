@@ -276,12 +276,7 @@ class _MotionStart:
         # what makes amplitudes with held conjugates unknowns; None without such
         device = make_stage(scene, state, self._held).device
         supports = self._support_inertia(is_viscous=viscous is not None)
-        # name of a rigid body -> the contact with it
-        body_contacts = {name: contact for name, (contact, _) in scene.model.contacts.items()}
-        shell_contacts = scene.model.shell_contacts
-        contact = None
-        if body_contacts or shell_contacts:
-            contact = ContactsInTime(scene.model.system, body_contacts, shell_contacts)
+        contact = ContactsInTime(scene.model) if scene.model.all_contacts else None
         surroundings = Surroundings(
             moving_amplitudes=load.drives, device=device, supports=supports, contact=contact
         )

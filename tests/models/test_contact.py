@@ -101,8 +101,7 @@ def test_derivative_of_the_mean_force_of_a_step_in_time(kind: str) -> None:
     """
     model = scene(kind).model
     system, part = model.system, 0.6
-    bodies = {name: contact for name, (contact, _) in model.contacts.items()}
-    contacts = ContactsInTime(system, bodies, [])
+    contacts = ContactsInTime(model)
     mu = dict.fromkeys(scene(kind).unloaded().mu, 0.4)
     rng = np.random.default_rng(5)
     begin, u, v = (

@@ -98,7 +98,7 @@ def test_pressure_is_uniform(tmp_path: Path) -> None:
         assert outcome.converged, outcome.reason
         state = outcome.state
     at = scene.model.system.at_state(state)
-    _, _, (_, at_points, _) = at.evaluate(touching._active_set)
+    _, at_points, _ = at.evaluate(touching._active_set).penalties
     in_cells = at.evaluate(touching.cell_pressures_and_gaps)[0]
     expected = P - SOFT * at.evaluate(touching.penetration) / (2 * h)
     assert at_points == pytest.approx(np.full(len(at_points), expected), rel=1e-3)

@@ -86,7 +86,8 @@ def test_derivatives(seed: int) -> None:
             term.pair.cuts: system.at_state(State(slid.ravel(), mu)).evaluate(term.improved_cuts)
         }
         assert (
-            system.at_state(State(u, mu)).evaluate(lambda: len(term._active_set()[0].point)) > 2000
+            system.at_state(State(u, mu)).evaluate(lambda: len(term._active_set().places.point))
+            > 2000
         )
     v = system.zero_at_supports(
         1e-7 * h * np.random.default_rng(seed + 9).standard_normal(system.size)
@@ -309,8 +310,8 @@ def test_folds_between_cells_have_no_jump(deep: float) -> None:
     mu = scene.unloaded().mu
     at = system.at_state(State(u, mu))
     Kv = times([(1.0, at.evaluate(term.entries))], v)
-    _, joined, _ = at.evaluate(term._active_set)
-    assert joined.several.any()
+    active = at.evaluate(term._active_set)
+    assert active.joined_places.several.any()
     low, high = (system.forces(u + side * v, mu, term.name) for side in (-0.5, 0.5))
     assert np.abs(high - low - Kv).max() < 1e-6 * np.abs(Kv).max()
 

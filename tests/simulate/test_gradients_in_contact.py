@@ -21,7 +21,6 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
-from magshell_fenicsx.parts.contact.frozen_contact import _area_ratio
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
@@ -248,7 +247,7 @@ def with_same_cuts(scene: Scene, last: Record, other: Scene) -> State:
     points, normals = scene.model.system.at_state(state).evaluate(
         lambda: one._cuts.points(number, one._displacement())
     )
-    area, its = (_area_ratio(one._cells, each._r0, points) for each in (one, same))
+    area, its = (one._area_ratio(points, each._r0) for each in (one, same))
     same._cuts._latest_points[number] = replace(points, weight=points.weight * its / area), normals
     return held_at(other, last, "lambda_m")
 

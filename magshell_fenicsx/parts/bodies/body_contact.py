@@ -44,6 +44,11 @@ from magshell_fenicsx.parts.gap import (
     penalty,
     thickness_ratio,
 )
+from magshell_fenicsx.parts.penalty_contact import (
+    CROSSING_DISTANCE,
+    GapAlongStep,
+    PenaltyContact,
+)
 
 Array = NDArray[np.float64]
 INDEX_PAIRS = np.triu_indices(3)  # i <= j of a Hessian
@@ -367,7 +372,31 @@ def _outer_square(a: Array) -> Array:
     return a[:, :, None] * a[:, None, :]
 
 
-class BodyContact:
+@dataclass(frozen=True)
+class PointConfiguration:
+    """Where the points of a shell are relative to a body; lengths are over R.
+
+    Attributes
+    ----------
+    r0
+        (cells, points, 3) undeformed places.
+    y
+        (cells, points, 3) displacements u - a d relative to the body.
+    factor
+        Thickness over h, one number or (cells * points,).
+    """
+
+    r0: Array
+    y: Array
+    factor: float | Array
+
+    @property
+    def places(self) -> Array:
+        """(cells * points, 3) places relative to the body at approach zero."""
+        return np.asarray((self.r0 + self.y).reshape(-1, 3))
+
+
+class BodyContact(PenaltyContact[PointConfiguration, Array]):
     """Contact of a rigid body with a shell: Taylor polynomials of its penalty at quadrature points.
 
     The polynomials are coefficients of the densities `contact_energy` and `thinned_energy`. They
@@ -412,6 +441,8 @@ class BodyContact:
     with its gradient and Hessian (`_gap_memo`), and the penalty (`_penalty_memo`). Points of all
     cells are also counted in one row: (points,) stands for (cells * points,).
     """
+
+    max_stiffening = 1e4
 
     def __init__(
         self,
@@ -470,9 +501,13 @@ class BodyContact:
             self._face_field.compute_by(self._compute_face_terms, inputs_of_forces)
 
     @property
-    def history(self) -> tuple[str, tuple[fem.Constant, float]]:
+    def options(self) -> ContactBody:
+        return self.contact
+
+    @property
+    def history(self) -> dict[str, tuple[fem.Constant, float]]:
         """The name, constant and default of its stiffness, which a state stores by this name."""
-        return self.contact.setting, (self.stiffness, self.contact.stiffness)
+        return {self.contact.setting: (self.stiffness, self.contact.stiffness)}
 
     @property
     def motion(self) -> Array:
@@ -495,17 +530,39 @@ class BodyContact:
         """Return the largest penetration over R, 0 without contact; collective."""
         return float(self.comm.allreduce(float((-self.gap).max(initial=0.0)), MPI.MAX))
 
-    def places(self) -> Array:
-        """Return the places (points, 3) over R of the points relative to the body."""
-        return np.asarray((self._placement_memo.renew() + self.place).reshape(-1, 3))
+    def relative_penetration(self) -> float:
+        """Return the largest penetration over h, 0 without contact; collective."""
+        return self.penetration() / self._h
 
-    def least_gap(self, places: Array) -> float:
-        """Return the least gap over R at places (points, 3) relative to the body; collective.
+    def penetration_message(self, stiffness: float, *, moving: bool) -> str:
+        depth, body = self.relative_penetration(), self.contact.body
+        if depth <= self.contact.max_penetration:
+            return ""
+        return (
+            f"the penetration of the body {body} is {depth:.3g} h, more than "
+            f"bodies.{body}.penetration: {self.contact.max_penetration:g}; its stiffness is "
+            f"{stiffness:.4g}: give four times as much"
+        )
 
-        The thickness is the present one.
+    def gap_along_step(
+        self, begin: PointConfiguration, end: PointConfiguration
+    ) -> GapAlongStep | None:
+        """Return the gap on the way of a step; None if nothing moves. Collective.
+
+        The places are those of quadrature points of this rank, the thickness is that at the end.
         """
-        gaps, _, _ = self.contact.gap(places, approach=0.0, half=self._h / 2 * self.factor)
-        return float(self.comm.allreduce(float(gaps.min(initial=np.inf)), MPI.MIN))
+        x, y, half = begin.places, end.places, self._h / 2 * end.factor
+        largest_approach = self.comm.allreduce(
+            float(np.linalg.norm(y - x, axis=1).max(initial=0.0)), MPI.MAX
+        )
+
+        def gap(part: float) -> float:
+            """Return the least gap over R after a part of the way."""
+            gaps, _, _ = self.contact.gap(x + part * (y - x), approach=0.0, half=half)
+            return float(self.comm.allreduce(float(gaps.min(initial=np.inf)), MPI.MIN))
+
+        crossing_distance = CROSSING_DISTANCE * self._h
+        return GapAlongStep(gap, largest_approach, crossing_distance) if largest_approach else None
 
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
         """Return the gap (points,), its gradient (points, 3) and its Hessian (points, 3, 3).
@@ -582,18 +639,12 @@ class BodyContact:
             )
         return face_terms.reshape(*self.polynomial.values.shape[:2], FACE_SIZE)
 
-    def expand_about(self, gap: Array) -> None:
-        """Replace the penalty by its Taylor polynomial about given gaps, for all later states.
+    def freeze(self) -> Array:
+        """Return the gaps (points,) over R, about which the penalty can be expanded."""
+        return self.gap
 
-        This serves differences by a number of the case. A hard body closes or opens within a far
-        smaller distance than such a difference moves the shell.
-
-        Parameters
-        ----------
-        gap
-            (points,) over R: the gaps of this contact at the state to expand about.
-        """
-        self._expansion_gap = (gap,)
+    def expand_about(self, frozen: Array) -> None:
+        self._expansion_gap = (frozen,)
 
     @property
     def place(self) -> Array:
@@ -609,14 +660,12 @@ class BodyContact:
         return self._factor_memo.renew()
 
     @property
-    def point_state(self) -> tuple[Array, float | Array]:
-        """The relative displacements and the thickness factors: `place` and `factor`."""
-        return self.place, self.factor
+    def configuration(self) -> PointConfiguration:
+        """The present places of the points relative to the body."""
+        return PointConfiguration(self._placement_memo.renew(), self.place, self.factor)
 
-    def average(
-        self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float
-    ) -> None:
-        """Use the mean forces of a step in time, until `use_present_forces` is called.
+    def average(self, begin: PointConfiguration, end: PointConfiguration, part: float) -> None:
+        """Use the mean force of a step in time, until `use_present_force` is called.
 
         The product of the mean force with the change of y is the change of psi, plus the energy
         that the step dissipates. The mean gradient is the mean of psi's gradient over the
@@ -624,21 +673,13 @@ class BodyContact:
         step counts in full. A dissipative force is added as in generalised alpha, the scheme of
         time integration: the change of the force over the step, times `part` - 1/2. See
         docs/theory.md, Motion.
-
-        Parameters
-        ----------
-        begin, end
-            Displacements y relative to the body, and thickness factors, at both ends of the step:
-            the values of `point_state` there.
-        part
-            Position within the step, from 0 to 1, at which the system takes its forces.
         """
         k, half = float(self.stiffness.value), self._h / 2
         soft_penetration = SOFT_PENETRATION * self._h
         # gaps with gradients n and Hessians N, each at the begin (0), middle (1) and end (2)
-        (y_begin, factor_begin), (y_end, factor_end) = begin, end
-        middle = (y_begin + y_end) / 2, (factor_begin + factor_end) / 2
-        gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
+        middle = (begin.y + end.y) / 2, (begin.factor + end.factor) / 2
+        states = (begin.y, begin.factor), middle, (end.y, end.factor)
+        gaps, n, N = zip(*(self._gap_at(*state) for state in states), strict=True)
         s0, _, s1 = (-gap for gap in gaps)  # penetrations at the begin and the end
         # the mean normal by Simpson's rule; the middle depends on the end of the step by half, so
         # that the derivative of the mean normal has the weights 4/6/2 and 1/6
@@ -668,8 +709,7 @@ class BodyContact:
             np.column_stack([by_t, mixed, second_by_t]),
         )
 
-    def use_present_forces(self) -> None:
-        """Use the forces of the present state again, after `average`."""
+    def use_present_force(self) -> None:
         self._step_derivatives = ()
 
     def cell_pressures(self) -> Array:

@@ -202,13 +202,13 @@ class ClosestPointSearch:
         """
         allowed = self._may_touch(i, j)
         i, j = i[allowed], j[allowed]
-        is_selected = ~self._are_near_in_surface(i * len(self._cells.nodes) + j)
+        is_selected = ~self.are_near_in_surface(i * len(self._cells.nodes) + j)
         near_pairs = np.flatnonzero(~is_selected)  # within the surface
         for r in surfaces:
             is_selected[near_pairs] |= self._are_folded(i[near_pairs], j[near_pairs], r, reach)
         return i[is_selected], j[is_selected]
 
-    def _are_near_in_surface(self, keys: Longs) -> Flags:
+    def are_near_in_surface(self, keys: Longs) -> Flags:
         """Return flags (n,): whether cells i and j are near within the undeformed surface.
 
         The keys (n,) are i * cells + j.
@@ -286,36 +286,6 @@ class ClosestPointSearch:
         pairs = self._select_pairs(*sphere_pairs, searched_reach, self._r0 + u)
         self._tracked[reach] = np.array(u), searched_reach, pairs
         return pairs
-
-    def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R between the faces at supported nodes, where faces overlap.
-
-        Only nodes count that may touch and are not near within the undeformed surface. The result
-        is negative if faces overlap there, and infinite if none do. It is also infinite if the
-        thickness depends on the displacement: such a displacement is not looked at.
-
-        Parameters
-        ----------
-        supported_nodes
-            Numbers (n,) of nodes that supports hold.
-        u
-            (nodes, 3) displacement over R.
-        """
-        if self._offsets and not self._offsets.is_constant:
-            return np.inf
-        count = len(self._cells.nodes)  # of cells, for the keys of pairs
-
-        def may_touch(i: Longs, j: Longs) -> Flags:
-            return np.asarray(self._may_touch(i, j) & ~self._are_near_in_surface(i * count + j))
-
-        return gap_between_supports(
-            supported_nodes=supported_nodes,
-            nodes=self._cells.nodes,
-            r0=self._r0,
-            u=u,
-            half_thickness=self.half_thickness,
-            may_touch=may_touch,
-        )
 
     def projections(
         self,
@@ -498,7 +468,7 @@ class ClosestPointSearch:
         if self._undeformed_points[0] is not points:  # undeformed places are kept for one set
             self._undeformed_points = points, self.places_of_points(points, self._undeformed_nodes)
         _, undeformed_x = self._undeformed_points
-        is_near = self._are_near_in_surface(i * len(self._cells.nodes) + j)
+        is_near = self.are_near_in_surface(i * len(self._cells.nodes) + j)
         undeformed = UndeformedPairs(
             is_near, self._undeformed_nodes, undeformed_x, SELF_CONTACT_DISTANCE
         )
@@ -526,7 +496,7 @@ class ClosestPointSearch:
         Only such cells are cut along each other.
         """
         keys = points.cell[places.point] * len(self._cells.nodes) + places.cell
-        return places.select(~self._are_near_in_surface(keys))
+        return places.select(~self.are_near_in_surface(keys))
 
     def thickness(self, points: ContactPoints, places: Projections) -> Array:
         """Return the mean (n,) of the undeformed thicknesses at points and places, over R."""
@@ -568,7 +538,7 @@ class ClosestPointSearch:
             # the place also counts if the surface is folded at the side: the neighbour is then the
             # material around the point, in which no place is searched
             key_of_cells = points.cell[places.point] * cell_count + neighbour
-            is_folded = places.is_above & self._are_near_in_surface(key_of_cells)
+            is_folded = places.is_above & self.are_near_in_surface(key_of_cells)
             is_nearest &= ~is_on_side | is_no_nearer_across | is_folded
         places = places.select(is_nearest)
         if not len(places.point):

@@ -16,15 +16,13 @@ stay in their cells.
 - Forces are derivatives of the energy by places, or by H as the last component; rates are
   derivatives along a motion.
 - A place is the closest place that a point faces: `place.point` is the number of that point.
-  Several places of a point in neighbouring cells are joined, and count as one: `group` has the
-  joined place of each place, `first` the row of the first place of each joined place.
+  Several places of a point in neighbouring cells are joined, and count as one (`ActiveSet`).
 - beta are the shape functions of a point, and minus those of its place.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dolfinx import fem
@@ -32,19 +30,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter
 from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.parts.contact.active_set import ActiveSet, Geometry
 from magshell_fenicsx.parts.contact.face_offsets import CellsWithNodes, FaceOffsets
-from magshell_fenicsx.parts.contact.gap_derivatives import distance_slopes, forces_on_nodes
-from magshell_fenicsx.parts.contact.projection import JoinedPlaces, Longs, Projections
-from magshell_fenicsx.parts.contact.segments import ContactPoints
-
-if TYPE_CHECKING:
-    from magshell_fenicsx.parts.contact.meridian_projection import (
-        MeridianPoints,
-        MeridianProjections,
-    )
+from magshell_fenicsx.parts.contact.gap_derivatives import forces_on_nodes
+from magshell_fenicsx.parts.contact.meridian_projection import MeridianProjections
+from magshell_fenicsx.parts.contact.projection import Longs, Projections
 
 Array = NDArray[np.float64]
-Penalty = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -93,17 +85,18 @@ class ContactState:
         (nodes, 3) undeformed places and displacement of all nodes.
     offsets
         Half the thickness where it varies; None where it is h/2.
-    points, places, joined_places
-        Contact points, the places that they face, and which of these are joined as one.
-    penalties
-        The penalty of joined places, with its two derivatives by the penetration.
+    active
+        The contact points, with the places in contact and the penalty there.
     forces
         (nodes, 3 or 4) derivatives of the energy by places and by H.
     find_entries_by_place_and_offset, find_entries
         Return entries of the second derivative by places and H, and by u.
-    geometry
-        Returns for n places the distances (n,), the normals (n, 3), beta (n, functions of both
-        cells), and the numbers of the nodes of these functions.
+    find_geometry
+        Returns the geometry of the places in contact.
+    weight_slopes
+        Returns relative derivatives (n, functions, 3) of points' weights by undeformed nodes, from
+        shape functions (n, functions) at the points and undeformed points (n, 3), both with their
+        derivatives by the coordinates of the cell.
 
     On a meridian vectors have two components in place of three.
     """
@@ -112,14 +105,12 @@ class ContactState:
     r0: Array
     u: Array
     offsets: FaceOffsets | None
-    points: "ContactPoints | MeridianPoints"
-    places: "Projections | MeridianProjections"
-    joined_places: JoinedPlaces
-    penalties: Penalty
+    active: ActiveSet[Projections] | ActiveSet[MeridianProjections]
     forces: Array
     find_entries_by_place_and_offset: Callable[[], Entries]
     find_entries: Callable[[], Entries]
-    geometry: Callable[[Any], tuple[Array, Array, Array, Longs]]
+    find_geometry: Callable[[], Geometry]
+    weight_slopes: Callable[[Array, Array], Array]
 
     @cached_property
     def required_offsets(self) -> FaceOffsets:
@@ -153,42 +144,9 @@ class ContactState:
         """
         return forces_on_nodes(self.offsets, self.u, forces)
 
-    def weight_slopes(self, tables: Array, places: Array) -> Array:
-        """Return relative derivatives (n, functions, 3) of points' weights by undeformed nodes.
-
-        They are the derivatives of a weight over the weight. A weight is proportional to the
-        undeformed area J0 = |a_1 x a_2|.
-
-        Parameters
-        ----------
-        tables
-            (3, n, functions) shape functions at points, and their two derivatives.
-        places
-            (3, n, 3) the undeformed places, and their derivatives a_1 and a_2.
-        """
-        _, a1, a2 = places
-        _, first_slopes, second_slopes = tables
-        area_vector = np.cross(a1, a2)
-        n = area_vector / np.sum(area_vector * area_vector, axis=1)[:, None]  # the normal over J0
-        # relative derivatives of J0 by a_1 and by a_2
-        by_first = np.cross(a2, n)[:, None]
-        by_second = np.cross(n, a1)[:, None]
-        return np.asarray(first_slopes[..., None] * by_first + second_slopes[..., None] * by_second)
-
     def penetration_rates(self, w: Array) -> Array:
         """Return the rates (m,) of the joined places' penetrations along a motion w (nodes, 3)."""
-        _, n, beta, nodes = self.geometry(self.places)
-        rates = self.unknown_rates(w)
-        # derivatives of the places' distances by places and H of nodes, times the rates of these;
-        # a penetration grows as the distance decreases
-        slopes = distance_slopes(n, beta, components=rates.shape[1])
-        closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
-        joined_places = self.joined_places
-        # the distance of a joined place changes by the weighted mean of its places' changes
-        of_joined = np.bincount(
-            joined_places.group, joined_places.weight * closing, len(joined_places.first)
-        )
-        return np.asarray(of_joined, dtype=float)
+        return self.active.closing_rates(self.find_geometry(), self.unknown_rates(w))
 
 
 @dataclass(frozen=True)
@@ -335,11 +293,12 @@ def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
     A weight is the undeformed area that belongs to a point; gaps do not change here.
     """
     forces = np.zeros_like(state.r0)
-    if not len(state.places.point):
+    active = state.active
+    if not len(active.places.point):
         return forces
-    value, pressure, _ = state.penalties
+    value, pressure, _ = active.penalties
     # the number of the contact point of each joined place
-    points, point = state.points, state.places.point[state.joined_places.first]
+    points, point = active.points, active.places.point[active.joined_places.first]
     # the weighted sum per area: along w the penalty changes by the pressure times the rate of the
     # penetration. It is halved, since both surfaces have points
     rates = state.penetration_rates(weights.w)

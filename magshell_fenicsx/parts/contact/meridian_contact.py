@@ -1,8 +1,7 @@
-"""Contact of shells with one axis on their meridians: the penalty of the gap as on surfaces.
+"""Contact of shells with one axis on their meridians.
 
-A point x of one curve has the closest place y of the other. Both curves have points, so that each
-has half of the penalty. With d = |x - y|, n = (x - y)/d, F = d^2/2,
-A = F,ss = |y'|^2 - (x - y) . y'' and changes D = dx - dy:
+A point x of one curve has the closest place y of the other. With d = |x - y|, n = (x - y)/d,
+F = d^2/2, A = F,ss = |y'|^2 - (x - y) . y'' and changes D = dx - dy:
 
     d,uu = [D . D - (n . D)^2 - C_s^2/A - C_theta^2/B]/d,   C_s = -D . y' - (x - y) . dy',
     B = rho_x rho_y
@@ -17,9 +16,8 @@ it stays. The points are those of a rule on each cell. At a free end one is next
 an edge stands on. docs/theory.md, Contact.
 
 A place is a closest place y: a cell with a coordinate X from 0 to 1 in it; it is free if it is
-inside the cell, so that it can move along the curve. The sides are the two members of a pair. The
-active set has the places in contact. U, V and W are displacements along rho, theta and z. A frozen
-contact keeps the active set of one state. A sample is a displacement within a step in time.
+inside the cell, so that it can move along the curve. U, V and W are displacements along rho, theta
+and z. `PairContact` has the words of every contact of a pair.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,52 +27,36 @@ from zlib import crc32
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.nonlocal_terms import Entries, pairs_of
-from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.parts.contact.closest_points import STEEP_COSINE, gap_between_supports
+from magshell_fenicsx.assembly.nonlocal_terms import Entries
+from magshell_fenicsx.parts.contact.active_set import FrozenContact, Geometry
+from magshell_fenicsx.parts.contact.closest_points import STEEP_COSINE
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL, Pair
 from magshell_fenicsx.parts.contact.face_offsets import unknown_numbers
-from magshell_fenicsx.parts.contact.field_derivatives import (
-    ContactFields,
-    ContactState,
-    EnergyWeights,
-    by_factor,
-    by_place,
-)
-from magshell_fenicsx.parts.contact.gap_derivatives import distance_slopes
+from magshell_fenicsx.parts.contact.field_derivatives import ContactFields
 from magshell_fenicsx.parts.contact.meridian_offsets import IN_PLANE, MeridianOffsets
 from magshell_fenicsx.parts.contact.meridian_projection import (
     COMPONENT_SIGNS,
     DISTANCE_TOLERANCE,
     CandidateSearch,
     MeridianCurves,
+    MeridianPoints,
     MeridianProjections,
     NeighbouringMaterial,
     distances,
     no_projections,
     slopes,
 )
-from magshell_fenicsx.parts.contact.model_surface import PENETRATION_TOLERANCE
+from magshell_fenicsx.parts.contact.pair_contact import ContactGeometry, PairContact
 from magshell_fenicsx.parts.contact.projection import (
     FOLLOW_ITERATIONS,
     JoinedPlaces,
     polynomial_bound,
 )
-from magshell_fenicsx.parts.contact.surface_contact import (
-    CROSSING_DISTANCE,
-    FULL_CONTACT_SHARE,
-    MAX_MOTION_PER_SAMPLE,
-    SEARCH_REACH,
-)
-from magshell_fenicsx.parts.contact.time_averaging import (
-    ContactTerm,
-    SampleCache,
-    SampleRates,
-    at_each_sample,
-)
-from magshell_fenicsx.parts.gap import SOFT_PENETRATION, GrownSurface, expanded_penalty, penalty
+from magshell_fenicsx.parts.contact.time_averaging import SampleCache, at_each_sample
+from magshell_fenicsx.parts.gap import GrownSurface
 
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -129,10 +111,14 @@ class ModelMeridian:
         element = self.r0.function_space.element.basix_element
         return MeridianCurves(element, self.nodes, self.places, self.h)
 
-    @property
-    def fields(self) -> ContactFields:
-        """The fields that gaps depend on."""
-        return ContactFields(self.r0, self.thickness, self.nodes, slice(None))
+    @cached_property
+    def geometry(self) -> ContactGeometry:
+        """The cells between which contact is sought: every rank has all, and all contact points."""
+        fields = ContactFields(self.r0, self.thickness, self.nodes, slice(None))
+        local_cells, comm = (0, len(self.nodes)), MPI.COMM_SELF
+        return ContactGeometry(
+            self.curves, self.places, self.u, self.h, fields, self.offsets, local_cells, comm
+        )
 
     @cached_property
     def offsets(self) -> MeridianOffsets | None:
@@ -154,7 +140,7 @@ class ModelMeridian:
         return MeridianOffsets(curves, r0, h, factor * rates, keeps_volume, self.natural.stretch)
 
 
-class MeridianContact(ContactTerm):
+class MeridianContact(PairContact[MeridianProjections]):
     """The contact energy of a pair on the meridian; a `Term` and a `NonlocalTerm` of `assembly`.
 
     Parameters
@@ -166,34 +152,27 @@ class MeridianContact(ContactTerm):
     sides
         (cells,) flags of the cells of the first shell, and of the second.
 
-    Private fields of the model: `_curves` are the meridians, `_nodes` (cells, functions) the nodes
-    of cells, `_r0` (nodes, 2) undeformed places, `_h` the thickness, and `_half` (nodes,) half the
-    undeformed thickness. `_nodes_of_pair` are the numbers of the nodes of both members. `_points`
-    are the quadrature points, `_normals` (cells, 2) undeformed normals of cells. `_candidates`
-    finds the cells near points, up to the distance `_reach`. `_material` is the material around
-    points of a shell that may touch itself; None for two shells. `_meridian_offsets` is half the
-    thickness where it varies, else None.
+    Private fields of the model, besides those of `PairContact`: `_curves` are the meridians,
+    `_points` the contact points and `_normals` (cells, 2) undeformed normals of cells.
+    `_candidates` finds the cells near points. `_material` is the material around points of a shell
+    that may touch itself; None for two shells. `_meridian_offsets` is half the thickness where it
+    varies, else None.
 
-    Private fields of the last active set: `_at` is its displacement, `_growth` the natural stretch
-    there, and `_places` are its places. `_active_sets` is a cache of such sets. `_frozen` is a
-    frozen contact that replaces the search: its places, and their penetrations.
+    Private fields of the last active set: `_places` and `_joined` have its places. `_active_sets`
+    is a cache.
     """
+
+    _points: MeridianPoints
+    common_translations = (0.0, 1.0)  # along the axis alone
+    ends_steps = False  # steps on which meridians meet do without
 
     def __init__(self, pair: Pair, model: ModelMeridian, sides: tuple[Flags, Flags]) -> None:
         """Prepare the points and the search; places are looked for at the first evaluation."""
-        super().__init__(pair, model.fields, model.offsets)
-        self._h, self._u, self._curves = model.h, model.u, model.curves
-        self._meridian_offsets = model.offsets
-        self._nodes, self._sides, self._r0 = model.nodes, sides, model.places
+        super().__init__(pair, model.geometry, sides)
+        self._curves, self._meridian_offsets = model.curves, model.offsets
         # Gauss's rule of n points is exact to the degree 2 n - 1
         self._points = self._curves.rule(model.degree // 2 + 1, sides)
         self._normals = self._curves.cell_normals()
-        self._half: Array = np.full(len(self._r0), self._h / 2)
-        if self._offsets:
-            self._half = self._offsets.undeformed_half_thickness
-        self._nodes_of_pair = np.unique(self._nodes[np.any(sides, axis=0)])
-        thickest = 2 * float(self._half[self._nodes_of_pair].max())
-        self._reach = self._h + (SEARCH_REACH - 1) * thickest
         self._material: NeighbouringMaterial | None = None
         if np.any(sides[0] & sides[1]):  # a shell and itself
             undeformed = np.column_stack([self._r0, self._half])
@@ -202,59 +181,23 @@ class MeridianContact(ContactTerm):
             self._material = NeighbouringMaterial(
                 undeformed_points, nodal, self._nodes, self._points.cell
             )
-        self._at = np.full_like(self._r0, np.nan)  # of the active set; nan: none has been found
-        self._growth = 0.0  # the natural stretch at that displacement
         self._places = no_projections()
-        self._active_sets = SampleCache[tuple[Array, MeridianProjections]]()
-        # the active set of another scene, and its penetrations
-        self._frozen: tuple[MeridianProjections, Array] | None = None
+        self._joined = JoinedPlaces.separate(self._places.distance)
+        self._active_sets = SampleCache[tuple[MeridianProjections, JoinedPlaces]]()
         self._candidates = CandidateSearch(
             self._points, self._nodes, sides, self._curves.element, self._material
         )
 
     # as a term
 
-    def energy(self) -> float:
-        """Return the energy of the whole shell over E h R^2."""
-        places = self._active_set()
-        energy_per_area, _, _ = self._penalty(places)
-        # half, since the points of the other curve have the same contact
-        return float(self._points.weight[places.point] @ energy_per_area) / 2
-
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 2) to the vector b; every rank has all nodes."""
         b[: forces.size] += forces.ravel()
-
-    def _forces(self) -> Array:
-        """Return derivatives (nodes, 2 or 3) of the energy by the places of all nodes.
-
-        Where the thickness varies, the third component is the derivative by the offset H.
-        """
-        places = self._active_set()
-        _, pressure, _ = self._penalty(places)
-        # half, since the points of the other curve have the same contact
-        force_of_places = self._points.weight[places.point] / 2 * pressure
-        # derivatives of the distances by the unknowns of the nodes of both cells
-        _, n, beta, nodes = self._geometry(places)
-        forces = np.zeros((len(self._r0), 3 if self._offsets else 2))
-        by_unknowns = distance_slopes(n, beta, components=forces.shape[1])
-        np.add.at(forces, nodes, -force_of_places[:, None, None] * by_unknowns)
-        return forces
 
     def _entries_by_place_and_offset(self) -> Entries:
         """Return entries of the second derivative by places (rho, z) and offsets H of nodes."""
         blocks, nodes = self._second_derivative(m=0.0)
         return self._block_entries(blocks, nodes, of_place=[0, 2])  # U and W
-
-    def _entries(self) -> Entries:
-        """Return the entries of the tangent by the displacement (U, W) of nodes."""
-        entries = self._entries_by_place_and_offset()
-        if not self._offsets:
-            return entries
-        # offsets depend on the displacement: by the chain rule, which needs the derivative of the
-        # energy by offsets, the entries become those by the displacement alone
-        by_offset = self._forces()[:, -1]
-        return self._offsets.entries(self._at, entries, by_offset)
 
     def _block_entries(self, H: Array, nodes: Longs, of_place: list[int]) -> Entries:
         """Return the entries of blocks by some components of nodes, and by H where it varies.
@@ -286,15 +229,8 @@ class MeridianContact(ContactTerm):
         """
         return float(crc32(self._cells_in_contact().tobytes()))
 
-    def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """Return pairs of nodes of cells in contact: the tangent may have entries between them."""
-        # the nodes of both cells, and each of them with each
-        nodes = np.concatenate([self._nodes[cells] for cells in self._cells_in_contact().T], axis=1)
-        rows, columns = pairs_of(nodes)
-        if not self._offsets:
-            return rows, columns
-        # an offset depends on the nodes of all cells around it, which are then coupled too
-        return self._offsets.coupled_pairs(rows, columns)
+    def _coupled_cells(self) -> Longs:
+        return self._cells_in_contact().T
 
     def _cells_in_contact(self) -> Longs:
         """Return the pairs (n, 2) of cells in contact: cell of the point, cell of the place.
@@ -302,8 +238,8 @@ class MeridianContact(ContactTerm):
         In a step in time they are those of all its samples.
         """
         pairs = [
-            np.column_stack([self._points.cell[places.point], places.cell])
-            for places in at_each_sample(self, self._active_set)
+            np.column_stack([self._points.cell[active.places.point], active.places.cell])
+            for active in at_each_sample(self, self._active_set)
         ]
         return np.asarray(np.unique(np.concatenate(pairs), axis=0))
 
@@ -332,73 +268,7 @@ class MeridianContact(ContactTerm):
             )
         return rows, columns, values / 2
 
-    def by_field(
-        self, name: str, direction: fem.Function, energy: float, force: float
-    ) -> tuple[fem.Function, Array] | None:
-        """Return derivatives of a weighted sum by the thickness or the placement.
-
-        The sum is `energy` Pi + `force` w . dPi/du, with the contact energy Pi.
-
-        Parameters
-        ----------
-        name
-            Name of the field: "thickness" or "r0".
-        direction
-            The displacement w.
-        energy, force
-            The weights of both terms.
-
-        Returns
-        -------
-        field, values
-            The field and derivatives (cells, functions, components) by its values; None for any
-            other name, and for a thickness that does not vary.
-        """
-        field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
-        if field is None:
-            return None
-        w = direction.x.array.reshape(-1, 2)[: len(self._r0)]
-        state, weights = self._state(), EnergyWeights(w, energy, force)
-        if name == "thickness":
-            return field, by_factor(state, weights)[..., None]  # by the factor of the thickness
-        # derivatives (nodes, 2) by undeformed places; each node's derivative is shared out among
-        # the cells that have the node
-        return field, self._fields.shared_by_cells(by_place(state, weights))
-
-    def _state(self) -> ContactState:
-        """Return the contact at the present state, for derivatives by fields.
-
-        `ContactState` is made for surfaces, where several places of a point may be joined as one.
-        On a meridian each place stands alone: each joined place has one place, with the weight 1.
-        """
-        places = self._active_set()
-        numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
-        joined_places = JoinedPlaces(
-            first=numbers, group=numbers, distance=places.distance, weight=ones, several=ones == 0
-        )
-        return MeridianContactState(
-            cells=self._curves,
-            r0=self._r0,
-            u=self._at,
-            offsets=self._offsets,
-            points=self._points,
-            places=places,
-            joined_places=joined_places,
-            penalties=self._penalty(places),
-            forces=self._forces(),
-            find_entries_by_place_and_offset=self._entries_by_place_and_offset,
-            find_entries=self._entries,
-            geometry=self._geometry,
-        )
-
     # what is observed
-
-    def force(self) -> float:
-        """Return the integral of the contact pressure, over E h R, at the present state."""
-        places = self._active_set()
-        _, pressure, _ = self._penalty(places)
-        # half, since the points of both curves have the same force
-        return float(self._points.weight[places.point] @ pressure) / 2
 
     def least_gap(self) -> float:
         """Return the least gap over R at present; nan where no faces are within the reach."""
@@ -426,227 +296,41 @@ class MeridianContact(ContactTerm):
         differences = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
         return min(float(distances(off).min()) for off in differences)
 
-    def penetration(self) -> float:
-        """Return the largest penetration over R, 0 without contact."""
-        return float((self._h - self._active_set().distance).max(initial=0.0))
+    def gap_along_step(self, begin: Array, end: Array) -> None:
+        return None
 
-    def relative_penetration(self) -> float:
-        """Return the largest penetration over the undeformed thickness there, 0 without contact.
-
-        The thickness is the mean of those at the point and at its place.
-        """
-        places, half = self._active_set(), self._half[self._nodes]
-        # half the thickness at points and at places: their sum is the mean thickness
-        shape, own_cell = self._points.shape[places.point], self._points.cell[places.point]
-        half_at_points = np.sum(shape * half[own_cell], axis=1)
-        shape_at_places = self._curves.table(0, places.X)[0]
-        half_at_places = np.sum(shape_at_places * half[places.cell], axis=1)
-        penetration = self._h - places.distance
-        return float((penetration / (half_at_points + half_at_places)).max(initial=0.0))
-
-    def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R at nodes that supports hold, where faces overlap.
-
-        It is infinite if no faces overlap there at the displacement u (nodes, 2). It is also
-        infinite if the thickness depends on the displacement: u is then not looked at.
-        """
-        if self._offsets and not self._offsets.is_constant:
-            return np.inf
-        return gap_between_supports(
-            supported_nodes, self._nodes, self._r0, u, self._half, self._may_touch
-        )
-
-    def _may_touch(self, cell: Longs, other: Longs) -> Flags:
-        """Return flags (n,): whether cells (n,) may touch the other cells (n,)."""
-        first, second = self._sides
-        is_pair = (first[cell] & second[other]) | (second[cell] & first[other])
-        if self._material:  # of one shell: not the same material
-            is_pair = is_pair & ~self._material.are_near(cell, other)
-        return np.asarray(is_pair)
-
-    def refuse_overlap(self) -> None:
-        """Check that the shells do not overlap undeformed.
-
-        Raises
-        ------
-        MeshError
-            If they do, with the place of the deepest penetration.
-        """
+    def deepest_penetration(self) -> tuple[float, Array]:
         undeformed = 0 * self._r0  # the displacement zero
         places = self._projections(undeformed, self._h)
-        penetration = self._h - places.distance
-        if len(penetration) and penetration.max() > PENETRATION_TOLERANCE * self._h:
-            deepest = places.point[int(penetration.argmax())]
-            rho, z = self._places_of_points(self._r0)[deepest]
-            place, depth = f"{rho:.4g}, 0, {z:.4g}", penetration.max() / self._h
-            raise MeshError(
-                f"contact: {self.pair.words} overlap undeformed, by {depth:.4g} h at ({place}) R: "
-                "move them apart"
-            )
-
-    def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
-        """Return pressure, gap and full contact of each cell.
-
-        Returns
-        -------
-        pressure
-            (cells,) the mean over E h/R.
-        gap
-            (cells,) the least over R, at most the reach less h.
-        is_full
-            (cells,) whether all of the cell is pressed.
-
-        Notes
-        -----
-        Where an end alone presses on a face, half of its point's force acts on each; see
-        `SurfaceContact.cell_pressures_and_gaps`.
-        """
-        places, count = self._active_set(), len(self._nodes)
-        cell, weight = self._points.cell, self._points.weight
-        # the area and the force of each cell: of a free end alone on a face, half of the force acts
-        # on the cell of the face
-        area = np.bincount(cell, weight, count)
-        _, pressure, _ = self._penalty(places)
-        force_of_places = weight[places.point] * pressure
-        # whether each place is at a free end, and whether its cell is steep to the point's
-        at_end, is_steep = self._end_and_steepness(places)
-        own_share = np.where(is_steep & ~at_end, 0.5, 1.0)
-        force = np.bincount(cell[places.point], own_share * force_of_places, count)
-        force = force + np.bincount(places.cell, (1 - own_share) * force_of_places, count)
-        # the least gap in each cell
-        gap = np.full(count, self._reach - self._h)
-        near_places = self._projections(self._displacement(), self._reach)
-        np.minimum.at(gap, cell[near_places.point], near_places.distance - self._h)
-        # the area that belongs to the points in contact
-        pressed_points = np.unique(places.point)
-        pressed_area = np.bincount(cell[pressed_points], weight[pressed_points], count)
-        is_full = (area > 0) & (pressed_area > FULL_CONTACT_SHARE * area)
-        return force / np.where(area > 0, area, 1.0), gap, is_full
-
-    def passes_through(self, u: Array, v: Array) -> bool:
-        """Return whether points pass through a curve on the straight way from u to v (nodes, 2).
-
-        Curves are looked at in samples of the way. Between two samples no point moves, relative to
-        another, by more than a part of the least thickness.
-        """
-        # half the thickness of the pair: undeformed, and at both ends of the way
-        halves = [
-            self._half_at(displacement)[self._nodes_of_pair] for displacement in (0 * u, u, v)
-        ]
-        least_thickness = 2 * min(float(half.min()) for half in halves)
-        motion = v - u
-        # the mean axial motion moves all curves alike
-        motion = motion - [0.0, motion[:, 1].mean()]
-        # number of parts of the way; twice the motion, since two points may move in opposite
-        # directions
-        farthest = 2 * np.linalg.norm(motion, axis=1).max()
-        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
-        reach = CROSSING_DISTANCE * least_thickness
-        samples = (u + k / count * (v - u) for k in range(1, count))
-        return any(
-            len(self._projections(displacement, reach, to_faces=False).point)
-            for displacement in samples
-        )
-
-    # in a step in time, see `TimeAveragedContact`
-
-    images_pass_through = passes_through  # there are no images on a meridian
-
-    @property
-    def displacement(self) -> Array:
-        """The present displacement (nodes, 2) of all nodes."""
-        return np.array(self._displacement())
-
-    def sample_rates(self, motion: Array) -> SampleRates:
-        """Return the penalty of the points at the present sample, with its rates along a motion.
-
-        Parameters
-        ----------
-        motion
-            (nodes, 2) displacement of the whole step.
-        """
-        places = self._active_set()
-        if self._offsets:  # faces also move as the thickness changes, the last component
-            motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
-        # derivatives of the distances by the unknowns of the nodes of both cells
-        _, n, beta, nodes = self._geometry(places)
-        by_unknowns = distance_slopes(n, beta, motion.shape[1])
-        # increase of the penetration over the step
-        closing = -np.einsum("nki,nki->n", by_unknowns, motion[nodes])
-        return SampleRates.sum_over_points(
-            count=len(self._points.weight),
-            point=places.point,
-            penetration=self._h - places.distance,
-            closing=closing,
-            k=self.stiffness.value,
-            soft_penetration=SOFT_PENETRATION * self._h,
-        )
+        if not len(places.point):
+            return 0.0, np.zeros(3)
+        deepest = int(places.distance.argmin())
+        rho, z = self._places_of_points(self._r0)[places.point[deepest]]
+        return float(self._h - places.distance[deepest]), np.array([rho, 0.0, z])
 
     # geometry
 
-    def _displacement(self) -> Array:
-        """Return the displacement (nodes, 2), at present or at the sample."""
-        if self.sample:
-            return self.sample.u
-        return np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
+    def _nodal_values(self, function: fem.Function) -> Array:
+        return np.asarray(function.x.array.reshape(-1, 2)[: len(self._r0)])
 
-    def _active_set(self) -> MeridianProjections:
-        """Return the places in contact at the present state, or at the sample of a step.
-
-        They are cached while the state stays. A frozen contact keeps its places, which move on in
-        their cells.
-        """
+    def _places_in_contact(self) -> tuple[MeridianProjections, JoinedPlaces]:
         u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
-        if self._frozen:
-            self._at = np.array(u)
-            frozen_places, _ = self._frozen
-            return self._follow(frozen_places) if len(frozen_places.point) else frozen_places
         # the places are found again where the displacement or the growth has changed
         if growth != self._growth or not np.array_equal(u, self._at):
-            self._at, self._places = self._active_sets.get(
-                (u, growth), lambda: self._find_places(np.array(u))
+            self._growth, self._at = growth, np.array(u)
+            self._places, self._joined = self._active_sets.get(
+                (u, growth), lambda: self._find_places(self._at)
             )
-            self._growth = growth
-        return self._places
+        return self._places, self._joined
 
-    def _find_places(self, u: Array) -> tuple[Array, MeridianProjections]:
-        """Return a displacement u (nodes, 2) together with its places that count."""
+    def _find_places(self, u: Array) -> tuple[MeridianProjections, JoinedPlaces]:
+        """Return the places that count at a displacement u (nodes, 2), each joined place of one."""
         places = self._projections(u, self._h)
-        return u, places.select(~self._are_left_to_edges(places))
+        counted = places.select(~self._are_left_to_edges(places))
+        return counted, JoinedPlaces.separate(counted.distance)
 
-    def _penalty(self, places: MeridianProjections) -> tuple[Array, Array, Array]:
-        """Return the penalty of places, with its two derivatives by the penetration, (n,) each.
-
-        They are the energy per area, the pressure, and the stiffness of the contact.
-        """
-        penetration, k = self._h - places.distance, self.stiffness.value
-        soft_penetration = SOFT_PENETRATION * self._h
-        if self._frozen:
-            # a Taylor polynomial about the frozen penetrations. A contact that is held at one
-            # state (`hold` of the base class) serves differences of tangents, which need the
-            # third order
-            is_held = self.held is not None
-            _, frozen_penetration = self._frozen
-            return expanded_penalty(
-                penetration, frozen_penetration, k, soft_penetration, with_third_order=is_held
-            )
-        penalties = penalty(penetration, k, soft_penetration)
-        return self.sample.weigh(places.point, penalties) if self.sample else penalties
-
-    def freeze(self) -> tuple[MeridianProjections, Array]:
-        """Return the active set of the present state, and its penetrations (n,) over R."""
-        places = self._active_set()
-        return places, self._h - places.distance
-
-    def expand_about(self, frozen: tuple[MeridianProjections, Array]) -> None:
-        """Use the frozen contact of another scene on the same mesh for all later states.
-
-        Parameters
-        ----------
-        frozen
-            The result of `freeze`: the places, and their penetrations (n,) over R.
-        """
-        self._frozen = frozen
+    def _own_points(self, frozen: FrozenContact[MeridianProjections]) -> MeridianPoints:
+        return self._points
 
     def _follow(self, places: MeridianProjections) -> MeridianProjections:
         """Return places moved on to where points project at present, by Newton's method.
@@ -669,12 +353,9 @@ class MeridianContact(ContactTerm):
 
         The last component is 0 unless `to_faces` is set. All are over R.
         """
-        offset = (self._half_at(u) - self._h / 2) * to_faces
+        half = self._offsets.half_thickness(u) if self._offsets else self._half
+        offset = (half - self._h / 2) * to_faces
         return np.column_stack([self._r0 + u, offset])
-
-    def _half_at(self, u: Array) -> Array:
-        """Return half the thickness (nodes,) over R at a displacement u (nodes, 2)."""
-        return self._offsets.half_thickness(u) if self._offsets else self._half
 
     def _places_of_points(self, r: Array) -> Array:
         """Return the points (n, dim) for nodes r (nodes, dim), dim 2 or 3.
@@ -735,17 +416,30 @@ class MeridianContact(ContactTerm):
         cosine = np.abs(np.sum(normals, axis=1))
         return np.asarray(at_end), np.asarray(cosine < STEEP_COSINE)
 
-    def _geometry(self, places: MeridianProjections) -> tuple[Array, Array, Array, Longs]:
-        """Return the distances between points and places, their normals, and beta with its nodes.
+    def _may_touch(self, cell: Longs, other: Longs) -> Flags:
+        """Return flags (n,): whether cells (n,) may touch others, which are not their material."""
+        is_pair = self._is_of_pair(cell, other)
+        return is_pair & ~self._material.are_near(cell, other) if self._material else is_pair
 
-        Returns
-        -------
-        d, n
-            (n,) distances of mid-surfaces over R, and (n, 2) unit vectors from places to points.
-        beta, nodes
-            (n, functions of both cells) shape functions of the point, minus those of the place; and
-            the numbers of their nodes.
-        """
+    def _mean_thickness(self, places: MeridianProjections) -> Array:
+        half = self._half[self._nodes]
+        # half the thickness at points and at places: their sum is the mean thickness
+        shape, own_cell = self._points.shape[places.point], self._points.cell[places.point]
+        half_at_points = np.sum(shape * half[own_cell], axis=1)
+        shape_at_places = self._curves.table(0, places.X)[0]
+        return np.asarray(half_at_points + np.sum(shape_at_places * half[places.cell], axis=1))
+
+    def _are_edges_alone(self, nearest: MeridianProjections) -> Flags:
+        at_end, is_steep = self._end_and_steepness(nearest)
+        return is_steep & ~at_end
+
+    def _places_within_reach(self) -> MeridianProjections:
+        return self._projections(self._displacement(), self._reach)
+
+    def _projections_of_midsurfaces(self, u: Array, reach: float) -> MeridianProjections:
+        return self._projections(u, reach, to_faces=False)
+
+    def _gap_geometry(self, places: MeridianProjections) -> Geometry:
         own_nodes = self._nodes[self._points.cell[places.point]]
         nodes = np.concatenate([own_nodes, self._nodes[places.cell]], axis=1)
         r = self._r0 + self._at
@@ -764,9 +458,9 @@ class MeridianContact(ContactTerm):
         psi'' d,u d,u - psi' d,uu. By the module's formula of d,uu they are the squares of four row
         vectors with a factor each, and the term D . D.
         """
-        places = self._active_set()
-        _, first, second = self._penalty(places)
-        d, n, beta, nodes = self._geometry(places)
+        active = self._active_set()
+        places, (_, first, second) = active.places, active.penalties
+        d, n, beta, nodes = self._gap_geometry(places)
         off = d[:, None] * n  # x - y
         # the places y with their derivatives along the curve, and A of the module's formula
         r = self._places_of_nodes(self._at)
@@ -824,6 +518,19 @@ class MeridianContact(ContactTerm):
         _fill_circumferential(circumferential, m, beta, y[:, :1], off, d, shape)
         return np.asarray(rows.reshape(4, count, 4 * functions).swapaxes(0, 1))
 
+    def weight_slopes(self, tables: Array, places: Array) -> Array:
+        """Return relative derivatives (n, functions, 2) of the points' weights by nodes.
+
+        The weight is rho |r'| times constants; the derivative along the curve is number 1 of the
+        shape functions and of the places.
+        """
+        tangent = places[1]  # r'; the relative derivative of |r'| is along r'/|r'|^2
+        direction = tangent / np.sum(tangent**2, axis=1)[:, None]
+        by_place = tables[1][..., None] * direction[:, None]
+        # that of rho, by the first component of places alone
+        by_place[..., 0] += tables[0] / places[0, :, :1]
+        return np.asarray(by_place)
+
 
 def _fill_circumferential(
     row: Array, m: float, beta: Array, rho_y: Array, off: Array, d: Array, shape: Array
@@ -852,28 +559,6 @@ def _fill_circumferential(
 def _inverse_where(condition: Flags, values: Array) -> Array:
     """Return 1/values where a condition holds, else 0."""
     return np.where(condition, 1 / np.where(condition, values, 1.0), 0.0)
-
-
-class MeridianContactState(ContactState):
-    """A contact on a meridian at a state."""
-
-    def weight_slopes(self, tables: Array, places: Array) -> Array:
-        """Return relative derivatives (n, functions, 2) of the points' weights by nodes.
-
-        The weight is rho |r'| times constants.
-
-        Parameters
-        ----------
-        tables, places
-            Shape functions (n, functions) at the points with derivatives, and the undeformed
-            points (n, 2) with derivatives; the derivative along the curve is number 1 of both.
-        """
-        tangent = places[1]  # r'; the relative derivative of |r'| is along r'/|r'|^2
-        direction = tangent / np.sum(tangent**2, axis=1)[:, None]
-        by_place = tables[1][..., None] * direction[:, None]
-        # that of rho, by the first component of places alone
-        by_place[..., 0] += tables[0] / places[0, :, :1]
-        return np.asarray(by_place)
 
 
 def meridian_contacts(pairs: Sequence[Pair], model: ModelMeridian) -> list[MeridianContact]:

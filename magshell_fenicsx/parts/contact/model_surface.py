@@ -11,9 +11,9 @@ stress. J0 is the undeformed area at a node. Nodes are those of the placement's 
 cells of other ranks at the border of this one.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from dolfinx import fem, mesh
@@ -22,19 +22,17 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.free_parameters import SettableNumber
 from magshell_fenicsx.assembly.global_mesh import GlobalCells, gather_rows, global_values
 from magshell_fenicsx.mesh.mirror import Image, Mirror
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL, Pair
 from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
 from magshell_fenicsx.parts.contact.field_derivatives import ContactFields
 from magshell_fenicsx.parts.contact.projection import Cells, Longs
 from magshell_fenicsx.parts.contact.segments import Segments
-from magshell_fenicsx.parts.contact.surface_contact import ContactGeometry, SurfaceContact
+from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact, SurfaceContactGeometry
 from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages, Images
 from magshell_fenicsx.parts.gap import GrownSurface
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-PENETRATION_TOLERANCE = 1e-6  # over h: an undeformed penetration below that is rounding
 
 
 @dataclass(frozen=True)
@@ -238,7 +236,7 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
             if all_cells.images
             else SurfaceContact(pair, geometry, sides)
         )
-        _refuse_overlap(contact, surface.h)
+        contact.refuse_overlap()
         contacts.append(contact)
     return contacts
 
@@ -248,7 +246,7 @@ def _contact_geometry(
     global_cells: GlobalCells,
     all_cells: _AllCells,
     own_dofs: tuple[int, int],
-) -> ContactGeometry:
+) -> SurfaceContactGeometry:
     """Return the cells of the model with all that the contacts of its pairs share.
 
     Parameters
@@ -278,10 +276,10 @@ def _contact_geometry(
     own_cells, degrees = np.array(global_cells.own_range), (surface.degree, element.degree)
     segments = Segments(cells, own_cells, r0, degrees, surface.h, surface.planes)
     own_rows = slice(first_cell, global_cells.own_range.stop)
-    return ContactGeometry(
+    return SurfaceContactGeometry(
         cells=cells,
         r0=r0,
-        displacement=_displacement_of(surface, images),
+        u=surface.u,
         h=surface.h,
         segments=segments,
         fields=ContactFields(surface.r0, surface.thickness, global_cells.nodes, own_rows),
@@ -290,30 +288,6 @@ def _contact_geometry(
         local_cells=(first_cell, len(surface.keeps_volume)),
         comm=surface.space.mesh.comm,
     )
-
-
-def _displacement_of(surface: ModelSurface, images: Images | None) -> Callable[[], Array]:
-    """Return a function that gives the present displacement (nodes, 3) of all cells; collective."""
-    if images is None:
-        return partial(global_values, surface.u)
-    return lambda: images.displacements(global_values(surface.u))
-
-
-def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
-    """Check that the surfaces of a contact do not overlap undeformed; collective.
-
-    Raises
-    ------
-    MeshError
-        On every rank if they do, with the depth and the place.
-    """
-    penetration, x = contact.deepest_penetration()
-    if penetration > PENETRATION_TOLERANCE * h:
-        place = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)  # no -0
-        raise MeshError(
-            f"contact: {contact.pair.words} overlap undeformed, by {penetration / h:.4g} h at "
-            f"({place}) R: move them apart"
-        )
 
 
 def _nodes_of_facets(V: fem.FunctionSpace, facets: Sequence[NDArray[np.int32]]) -> Longs:

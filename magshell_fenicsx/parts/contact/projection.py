@@ -16,7 +16,7 @@ stands for the pair of cells i and j. Lengths are over R.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -797,3 +797,24 @@ class JoinedPlaces:
         distance = least_distance - blur * np.log(sum_of_exponentials)
         weight = exponential / sum_of_exponentials[group]
         return cls(first, group, distance, weight, several=counts > 1)
+
+    @classmethod
+    def separate(cls, distance: Array) -> "JoinedPlaces":
+        """Return joined places of one place each, at distances (n,) from their points."""
+        rows, ones = np.arange(len(distance)), np.ones(len(distance))
+        return cls(rows, rows, distance, ones, several=ones == 0)
+
+    def moved_by(self, change: Array, blur: float) -> "JoinedPlaces":
+        """Return the same joined places after small changes (n,) of the distances of their places.
+
+        The joined distances change by the weighted means, the weights by their first derivatives.
+
+        Parameters
+        ----------
+        blur
+            Length e over R of the smoothed minimum.
+        """
+        mean_change = np.bincount(self.group, self.weight * change, len(self.first))
+        # weights are exp(-d/e) over their sum, here to first order in the changes of distances d
+        weight = self.weight * (1 - (change - mean_change[self.group]) / blur)
+        return replace(self, distance=self.distance + mean_change, weight=weight)

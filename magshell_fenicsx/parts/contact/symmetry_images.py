@@ -25,7 +25,7 @@ from magshell_fenicsx.assembly.nonlocal_terms import Entries
 from magshell_fenicsx.mesh.mirror import Image
 from magshell_fenicsx.parts.contact.contact_section import Pair
 from magshell_fenicsx.parts.contact.projection import Cells, Longs
-from magshell_fenicsx.parts.contact.surface_contact import ContactGeometry, SurfaceContact
+from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact, SurfaceContactGeometry
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -144,6 +144,9 @@ class ContactWithImages(SurfaceContact):
         this rank, since forces are first summed over all of them.
     sides
         (cells,) flags of the cells of the first member of the pair, and of the second.
+
+    The field `_images` moves the copies as the state does, and `_images_of_changes` as changes of
+    the state do, which may be antisymmetric to the plane.
     """
 
     def __init__(
@@ -151,12 +154,13 @@ class ContactWithImages(SurfaceContact):
         images: Images,
         modelled_dofs: tuple[int, int],
         pair: Pair,
-        geometry: ContactGeometry,
+        geometry: SurfaceContactGeometry,
         sides: tuple[Flags, Flags],
     ) -> None:
         """Prepare the contact of all copies as if they were modelled."""
         super().__init__(pair, geometry, sides)
         self._images, self._modelled_dofs = images, modelled_dofs
+        self._images_of_changes = images
 
     def antisymmetric(self) -> "ContactWithImages":
         """Return this term for changes of u that are antisymmetric to the plane.
@@ -165,7 +169,7 @@ class ContactWithImages(SurfaceContact):
         """
         # the search and the active set are those of the symmetric state: only P differs
         antisymmetric_term = copy(self)
-        antisymmetric_term._images = replace(self._images, parity=-1.0)
+        antisymmetric_term._images_of_changes = replace(self._images, parity=-1.0)
         return antisymmetric_term
 
     def _add(self, b: Array, forces: Array) -> None:
@@ -173,11 +177,11 @@ class ContactWithImages(SurfaceContact):
         of_copies = np.zeros(self._images.matrix.shape[0])  # (3 copies count,)
         super()._add(of_copies, forces)
         start, size = self._modelled_dofs
-        b[:size] += self._images.sum_forces(of_copies)[start : start + size]
+        b[:size] += self._images_of_changes.sum_forces(of_copies)[start : start + size]
 
     def entries(self) -> Entries:
         """Return the entries of the model's tangent, from those of all copies; collective."""
-        return self._images.sum_entries(super().entries())
+        return self._images_of_changes.sum_entries(super().entries())
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
         """Return pairs of the model's nodes between which the tangent may have entries; collective.

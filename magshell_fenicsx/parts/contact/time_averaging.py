@@ -15,25 +15,18 @@ it takes forces at a part of the step, and dissipates high frequencies. A frozen
 active set, the places in contact, of one state.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.free_parameters import FreeParameter
-from magshell_fenicsx.assembly.nonlocal_terms import Entries
-from magshell_fenicsx.parts.contact.contact_section import Pair
-from magshell_fenicsx.parts.contact.face_offsets import FaceOffsets
-from magshell_fenicsx.parts.contact.field_derivatives import (
-    ContactFields,
-    ContactState,
-    with_growth,
-)
-from magshell_fenicsx.parts.contact.gap_derivatives import forces_on_nodes
 from magshell_fenicsx.parts.gap import PENETRATION_ROUNDING, penalty
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.contact.pair_contact import PairContact
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -163,42 +156,8 @@ class SampleCache(Generic[Value]):
         return value
 
 
-class TimeAveragedContact(Protocol):
-    """A contact whose force may be the mean force of a step in time.
-
-    Attributes
-    ----------
-    pair
-        The two members of the contact.
-    samples
-        The samples of the step; empty while the contact has the force of the present state.
-    sample
-        The sample at which the contact is evaluated now; None for the present state.
-    """
-
-    pair: Pair
-    samples: Sequence[StepSample]
-    sample: StepSample | None
-
-    @property
-    def displacement(self) -> Array:
-        """The present displacement (nodes, 2 or 3) of all cells; collective."""
-
-    def penetration(self) -> float:
-        """Return the largest penetration over R; collective."""
-
-    def images_pass_through(self, u: Array, v: Array) -> bool:
-        """Return whether points pass through a surface on the way from u to v; collective."""
-
-    def sample_rates(self, motion: Array) -> SampleRates:
-        """Return the penalty of the points at this sample, with its rates along a motion.
-
-        The motion (nodes, 2 or 3) is the displacement of the whole step.
-        """
-
-
 def samples_of_step(
-    contact: TimeAveragedContact, begin: Array, end: Array, part: float
+    contact: "PairContact[Any]", begin: Array, end: Array, part: float
 ) -> list[StepSample]:
     """Return the samples whose weighted sum is the force of a contact in a step; collective.
 
@@ -292,7 +251,7 @@ def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
 
 
 def at_each_sample(
-    contact: TimeAveragedContact, compute: Callable[[], Value], *, tangent: bool = False
+    contact: "PairContact[Any]", compute: Callable[[], Value], *, tangent: bool = False
 ) -> list[Value]:
     """Return a value at each sample of the step; without a step, one at the present state.
 
@@ -311,153 +270,3 @@ def at_each_sample(
         values.append(compute())
     contact.sample = None
     return values
-
-
-@dataclass
-class StateNumber:
-    """A number that a state sets."""
-
-    value: float
-
-
-class ContactTerm:
-    """The base of the contact terms of a pair, on surfaces and on meridians.
-
-    A subclass gives forces and `_entries` at one sample, and fixes its active set in `freeze`.
-
-    Attributes
-    ----------
-    stiffness
-        Stiffness k of the penalty, over E h/R^2.
-    samples
-        The samples of a step in time; empty while the contact has the force of the present state.
-    sample
-        The sample at which the contact is evaluated now; None for the present state.
-    held
-        The frozen contact of one state that replaces the search in all states; None without. It is
-        set by `hold`.
-    pair, name, group
-        The two members, and the name of the term, which is also that of its group.
-    amplitude, column
-        None and "": no load parameter multiplies the energy, which has no column in results.
-
-    The field `_at` is the displacement of the last active set. `_fields` are the fields of the case
-    on which gaps depend, and `_offsets` is half the thickness at nodes; None where it is h/2.
-    `_frozen` is the frozen contact that replaces the search, if there is one.
-    """
-
-    amplitude = None
-    column = ""
-
-    def __init__(self, pair: Pair, fields: ContactFields, offsets: FaceOffsets | None) -> None:
-        """Begin outside a step in time, with the pair's stiffness, and with no contact held.
-
-        Parameters
-        ----------
-        fields
-            The fields of the case on which gaps depend, such as the thickness.
-        offsets
-            Half the thickness at nodes; None where it is h/2 everywhere and in all states.
-        """
-        self.pair, self.name = pair, f"contact{pair.suffix}"
-        self._fields, self._offsets = fields, offsets
-        self._at: Array = np.zeros((0, 0))  # the displacement of the active set
-        self.group = self.name
-        self.stiffness = StateNumber(pair.stiffness)
-        self.samples: Sequence[StepSample] = ()
-        self.sample: StepSample | None = None
-        self.held: Any = None
-        self._frozen: Any = None  # the frozen contact that replaces the search, if there is one
-
-    def hold(self, frozen: Any) -> None:
-        """Fix the active set for all states by a frozen contact, or release it with None.
-
-        Parameters
-        ----------
-        frozen
-            The result of `freeze` at one state.
-        """
-        self.held = self._frozen = None
-        # `expand_about` sets `_frozen`; called by itself it serves another scene's contact, and
-        # then `held` stays None
-        if frozen is not None:
-            self.expand_about(frozen)
-            self.held = frozen
-
-    def expand_about(self, frozen: Any) -> None:
-        """Use the active set of another scene on the same mesh, fixed, for all later states."""
-        raise NotImplementedError
-
-    @property
-    def history(self) -> dict[str, tuple[StateNumber, float]]:
-        """The numbers that a state sets, with defaults; see `FiniteElementSystem`."""
-        return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
-
-    def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor dPi/du to the vector b; collective."""
-        forces = at_each_sample(self, lambda: self._on_nodes(self._forces()))  # type: ignore[arg-type]
-        self._add(b, factor * np.sum(forces, axis=0))
-
-    def compile_residual(self) -> None:
-        """Do nothing: the term has no forms."""
-
-    compile_tangent = compile_residual
-
-    def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """Add nothing: the tangent's assembly takes `entries`."""
-
-    def entries(self) -> Entries:
-        """Return this rank's entries of the tangent, summed over the samples of a step; collective.
-
-        See `NonlocalTerm`.
-        """
-        # a position in the matrix may come several times: such entries are added
-        samples = at_each_sample(self, self._entries, tangent=True)  # type: ignore[arg-type]
-        rows, columns, values = zip(*samples, strict=True)
-        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
-
-    def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
-        """Return the free parameters on which the faces depend, with this term's derivatives.
-
-        Only the natural stretch moves faces, through the thickness of a shell that has grown. The
-        result has this parameter alone, with the contact forces added to its derivatives; it is
-        empty where nothing grows.
-
-        Parameters
-        ----------
-        parameters
-            Name -> number that varies in the energies.
-        """
-        amplitude = self._offsets.amplitude if self._offsets else None  # the natural stretch
-        return {
-            name: with_growth(p, self._state, self._add)
-            for name, p in parameters.items()
-            if p.constant is amplitude
-        }
-
-    def _on_nodes(self, forces: Array) -> Array:
-        """Return the derivative (nodes, dim) by the displacement, from that by places and H.
-
-        H depends on the displacement.
-        """
-        # `_forces` has set `_at` to its displacement
-        return forces_on_nodes(self._offsets, self._at, forces)
-
-    def _forces(self) -> Array:
-        """Return the derivative (nodes, dim) of this rank's energy by the places of all nodes.
-
-        (nodes, dim + 1) with that by the offsets H where they vary.
-        """
-        raise NotImplementedError
-
-    def _entries(self) -> Entries:
-        """Return the entries of the tangent at the present state or sample; collective."""
-        raise NotImplementedError
-
-    def _state(self) -> ContactState:
-        """Return the contact at the present state, for derivatives by fields; collective."""
-        raise NotImplementedError
-
-    def _add(self, b: Array, forces: Array) -> None:
-        """Add forces (nodes, 2 or 3) of this rank's points to the vector b; collective."""
-        raise NotImplementedError

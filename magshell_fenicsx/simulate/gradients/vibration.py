@@ -43,9 +43,9 @@ from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.simulate.contact_control import (
     contact_expanded_about,
     refuse_touching_shells,
-    shell_penetrations,
     stiffened_equilibrium,
     touching_bodies,
+    touching_shells,
 )
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NO_BEGINS,
@@ -315,7 +315,7 @@ def _adjoint(
     # factor of the eigenvalue of each mode in J, which has their mean
     factor = rate / len(vibration.modes)
     # where shells touch, differences need fixed places in contact: an expansion about the state
-    shells_touch = any(depth > 0 for _, depth in shell_penetrations(scene, state))
+    shells_touch = bool(touching_shells(scene, state))
     contact_state = state if shells_touch else None
     if contact_state and waves_of_label(vibration.modes[0].label) is not None:
         refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")

@@ -230,6 +230,18 @@ def test_contact_derivatives(hole: float | None, z: float, shell: dict[str, Any]
     assert wave @ Q @ wave == pytest.approx(v @ K @ v / 2, rel=1e-12)
 
 
+def test_a_released_contact_is_that_of_its_state() -> None:
+    """A contact that was held at a light state has, once released, the energy of the deep one."""
+    scene = touching(cap(radius=1.3), 2.3 + (1 + 1e-4) * h, PRESSURE)
+    system, (contact,) = scene.model.system, scene.model.shell_contacts
+    deep, light = (system.at_state(pressed(scene, depth)) for depth in (0.05, 0.01))
+    energy = deep.evaluate(contact.energy)
+    contact.hold(light.evaluate(contact.freeze))
+    assert deep.evaluate(contact.energy) != energy
+    contact.hold(None)
+    assert deep.evaluate(contact.energy) == energy
+
+
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
 def test_an_edge_presses_on_a_face(symmetry: str) -> None:
     """The pressure over each of both shells is the contact force."""
@@ -284,7 +296,7 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
     system, state, (contact,) = scene.model.system, pressed(scene, 0.05), scene.model.shell_contacts
     at = system.at_state(state)
     faced, (H, nodes) = (
-        at.evaluate(contact._active_set),
+        at.evaluate(contact._active_set).places,
         at.evaluate(lambda: contact._second_derivative(m)),
     )
     r = scene.model.r0.x.array.reshape(-1, 2)
