@@ -169,6 +169,7 @@ def run(
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
     from magshell_fenicsx.public import run as run_case
+    from magshell_fenicsx.quantities.quantity import number_with_error
     from magshell_fenicsx.runs.files import AlreadyComplete
 
     gc.freeze()  # what is imported stays
@@ -182,9 +183,11 @@ def run(
     # the process ends soon: another garbage collection takes longer than importing dolfinx
     gc.freeze()
     if result.knockdown is not None:
-        print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
+        k_d = number_with_error(result.knockdown, result.errors.get("knockdown"))
+        print_line(f"knockdown factor k_d = {k_d}")
     if result.barrier is not None:
-        print_line(f"energy barrier = {result.barrier:.9g} E h R^2")
+        barrier = number_with_error(result.barrier, result.errors.get("barrier"))
+        print_line(f"energy barrier = {barrier} E h R^2")
     print_line(f"results in {folder}/")
     if result.stopped:
         for remark in result.remarks:

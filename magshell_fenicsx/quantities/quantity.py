@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import nan, pi, sqrt
+from math import ceil, floor, inf, isfinite, log10, nan, pi, sqrt
 from typing import Literal
 
 Kind = Literal[
@@ -214,6 +214,41 @@ def format_number(value: float, form: str) -> str:
     text = f"{value:{form}}"
     # what rounds to zero may have a minus sign
     return text if float(text) else f"{0.0:{form}}"
+
+
+def number_with_error(value: float, error: float | None, digits: int = 9) -> str:
+    """Return a number with the digits that its error leaves, and the error of the last one.
+
+    The error is rounded up to one digit. Without an error, or with one that is smaller than the
+    last of `digits` significant digits, the number has these digits.
+
+    Examples
+    --------
+    >>> number_with_error(0.3262333, 1.2e-6), number_with_error(0.3262333, 1e-12, 6)
+    ('0.326233(2)', '0.326233')
+    >>> number_with_error(1.84e-5, 2e-8), number_with_error(27532.1, 31.0)
+    ('1.840(2)e-05', '27530(40)')
+    >>> number_with_error(0.3, 2.0), number_with_error(-0.0996, 0.0095, 6)
+    ('0(2)', '-0.10(1)')
+    """
+    plain = f"{value:.{digits}g}"
+    if error is None or not 0 < error < inf or not isfinite(value):
+        return plain
+    # the error is `count` units of the decimal place `place`
+    place = floor(log10(error))
+    count = ceil(round(error / 10.0**place, 6))
+    if count == 10:
+        count, place = 1, place + 1
+    exponent = floor(log10(abs(value))) if value else place
+    if place <= exponent - digits:
+        return plain
+    # a number that would begin with many zeros, or end with them, has a power of ten
+    power = 0 if -5 < exponent < digits else exponent
+    decimals = max(power - place, 0)
+    mantissa = round(value / 10.0**power, power - place)
+    scale = 1 if place <= power else 10 ** (place - power)
+    suffix = f"e{power:+03d}" if power else ""
+    return f"{mantissa + 0.0:.{decimals}f}({count * scale}){suffix}"
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,10 @@ REMARK_ON_BRANCH = (
     "at the end of the branch the estimated relative error is {:.2g}, on a mesh of the larger "
     "model's own"
 )
+LARGE_ERROR_WARNING = (
+    "warning: the estimated error of {} is {:.2g} % of it, by the mesh: give a larger "
+    "mesh.refinement, or mesh.tolerance"
+)
 ROUNDING = 1e-9  # over h: a smaller displacement is printed as zero
 
 
@@ -446,6 +450,10 @@ def _write_results(
     result.replayed = files.journal.replayed
     pictures = output.pictures and not interruption  # an interrupted run draws none
     try:
+        if not interruption:
+            progress.doing("errors by one degree more")
+            for name, error in result.large_errors.items():
+                output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
         files.write_summary(summary(result, time.perf_counter() - output.start))
         if not interruption:
             progress.doing("modes and pictures")

@@ -10,6 +10,7 @@ h, R, D are Young's modulus, thickness, reference length and bending stiffness.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,9 +37,17 @@ from magshell_fenicsx.simulate.scene import Scene
 
 if TYPE_CHECKING:
     from magshell_fenicsx.simulate.adapt.choice import Adapted
+    from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates
 
 Array = NDArray[np.float64]
 
+# result -> its names in units, of which a case has at most one
+IN_UNITS = {
+    "knockdown": {"buckling_pressure_Pa"},
+    "critical_field": {"critical_field_mT", "critical_field_percent"},
+    "barrier": {"barrier_mJ"},
+}
+LARGE_ERROR = 0.01  # relative: a larger estimated error is warned of
 JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # parts of the way of a snap, between which it jumps
 
 
@@ -200,6 +209,61 @@ class Result:
     last_record: Record | None = None
     scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
 
+    @cached_property
+    def error_estimates(self) -> "ErrorEstimates":
+        """Estimated errors of the results, and why others have none.
+
+        The first access is collective, and solves with one degree more on the same mesh.
+        """
+        # a run whose errors nobody asks for does without
+        from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates, estimate_errors
+
+        if self.stopped:
+            return ErrorEstimates(reasons={"end": "the run stopped early"})
+        estimates, with_units = estimate_errors(self.scene, self.path_history), in_units(self)
+        errors = estimates.errors
+        # the same errors of results in units
+        for name, number in self._main_results.items():
+            for key in IN_UNITS[name] & with_units.keys():
+                if number and name in errors:
+                    errors[key] = errors[name] * abs(with_units[key] / number)
+        return estimates
+
+    @property
+    def _main_results(self) -> dict[str, float | None]:
+        """Name of a result that has a key of its own in summary.json -> its value."""
+        return {
+            "knockdown": self.knockdown,
+            "critical_field": self.critical_field,
+            "barrier": self.barrier,
+        }
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Name of a result -> its estimated absolute error; the first access is collective."""
+        return self.error_estimates.errors
+
+    @property
+    def large_errors(self) -> dict[str, float]:
+        """Result -> its estimated relative error, where this is above `LARGE_ERROR`; collective.
+
+        At the end of the path the results are the column of the load and that of its conjugate. An
+        error there is over the largest value on the path.
+        """
+        results = self._main_results
+        if self.limit_points and not (self.knockdown or self.critical_field):
+            results["limit_load"] = self.limit_points[0]["value"]
+        if self.path_history.end and (name := self.path_history.end.amplitude):
+            loaded = amplitude(name)
+            for column in {loaded.column, loaded.conjugate} & self.rows[0].keys():
+                results[f"{column}@end"] = max(abs(float(row[column])) for row in self.rows)
+        relative_errors = {
+            name: self.errors[name] / abs(value)
+            for name, value in results.items()
+            if value and name in self.errors
+        }
+        return {name: error for name, error in relative_errors.items() if error > LARGE_ERROR}
+
     def scene_of(self, row: int) -> Scene:
         """Return the scene (model and solver) of the row with a number."""
         return self.scenes_of_rows.get(row, self.scene)
@@ -347,6 +411,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "knockdown": result.knockdown,
         "critical_field": result.critical_field,
         "barrier": result.barrier,
+        "errors": result.errors,
+        "errors_not_estimated": result.error_estimates.reasons,
         "snaps": snaps_of_run,
         **snap_times,
         **observed,

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from html import unescape
 from math import atan2, degrees, hypot, isclose
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from markupsafe import Markup
@@ -25,7 +26,7 @@ from magshell_fenicsx.output.store.durable import damage
 from magshell_fenicsx.output.store.stored_results import is_flat, pole_of, read_summary, shell_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, pole_name, read_lines
 from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC
-from magshell_fenicsx.quantities.quantity import Quantity, plain_text
+from magshell_fenicsx.quantities.quantity import Quantity, number_with_error, plain_text
 from magshell_fenicsx.quantities.registry import (
     OWN_MODES,
     amplitude,
@@ -40,20 +41,29 @@ MIN_PLAIN, MAX_PLAIN = 1e-3, 1e6  # magnitudes between them are written without 
 DIGITS = 6
 MIN_OVERSHOOT = 0.1  # per cent
 Summary = Mapping[str, Any]
+NO_ERRORS: Mapping[str, float] = MappingProxyType({})
+END = "@end"  # what the name of a column at the last point ends with
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
 # degrees: a dimple at the pole is deepest on a ring as small as this, at no azimuth
 NEAR_POLE = 5.0
 EQUAL_COLUMNS_TOLERANCE = 1e-9  # relative and absolute
 
 
-def number(value: float, digits: int = DIGITS) -> Markup:
+def number(value: float, digits: int = DIGITS, error: float | None = None) -> Markup:
     """Return a number with at most `digits` significant digits.
+
+    An estimated error that changes these digits stands behind them; see `number_with_error`.
 
     Examples
     --------
     >>> number(0.32623330500000004), number(90.0), number(1.84e-05), number(1e-4)
     (Markup('0.326233'), Markup('90'), Markup('1.84 · 10<sup>−5</sup>'), Markup('10<sup>−4</sup>'))
+    >>> number(0.3262333, error=1.2e-4), number(1.84e-05, error=2e-8)
+    (Markup('0.3262(2)'), Markup('1.840(2) · 10<sup>−5</sup>'))
     """
+    mantissa, _, exponent = number_with_error(value, error, digits).partition("e")
+    if mantissa.endswith(")"):
+        return _signed(mantissa) + (Markup(" · ") + power(int(exponent)) if exponent else "")
     if value == 0 or MIN_PLAIN <= abs(value) < MAX_PLAIN:
         return _signed(f"{value:.{digits}g}")
     mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
@@ -421,14 +431,21 @@ def _barrier(summary: Summary) -> Markup:
     """Return a sentence on the energy barrier, in E h R², and in mJ in a case with units."""
     measured = summary.get("in_units", {}).get("barrier_mJ")
     size = Markup(" ({} mJ)").format(number(measured)) if measured is not None else ""
-    return Markup("The energy barrier is {} E h R²{}.").format(number(summary["barrier"]), size)
+    error = summary.get("errors", {}).get("barrier")
+    barrier = number(summary["barrier"], error=error)
+    return Markup("The energy barrier is {} E h R²{}.").format(barrier, size)
 
 
-def value(line: Line, summary: Summary) -> Markup:
+def value(line: Line, summary: Summary, errors: Mapping[str, float] = NO_ERRORS) -> Markup:
     """Return the amplitude that varied at a point, such as "p/p_c = 0.326233 (53.7 Pa)".
 
     It is in units alone, "t = 2 s", where the dimensionless number is the same. So is the pressure
     on a flat shell, for which p_c means nothing.
+
+    Parameters
+    ----------
+    errors
+        Column -> its estimated error at the point.
     """
     name = amplitude(line["amplitude"]).column
     degree_sign = "°" if line["amplitude"] == "angle" else ""
@@ -441,7 +458,9 @@ def value(line: Line, summary: Summary) -> Markup:
     is_clear_in_units = is_same_in_units or is_flat_pressure
     if has_unit and is_clear_in_units:
         return Markup("{} = {} {}").format(
-            head(shown_column), number(float(line[shown_column.name])), shown_column.si
+            head(shown_column),
+            number(float(line[shown_column.name]), error=errors.get(shown_column.name)),
+            shown_column.si,
         )
     measured = Markup()
     if has_unit:
@@ -449,7 +468,7 @@ def value(line: Line, summary: Summary) -> Markup:
             number(float(line[shown_column.name])), shown_column.si
         )
     return Markup("{} = {}{}{}").format(
-        symbol(name), number(float(line[name])), degree_sign, measured
+        symbol(name), number(float(line[name]), error=errors.get(name)), degree_sign, measured
     )
 
 
@@ -506,7 +525,7 @@ def _instability(
     if line["mode"]:  # a number of waves, or a symmetry in words
         is_wave = line["mode"] not in (*OWN_MODES, ANTISYMMETRIC)
         kind += f" ({line['mode']}{' waves' if is_wave else ''})"
-    load = value(line, summary)
+    load = value(line, summary, _errors_of_load(line, summary))
     displacement = _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
@@ -515,6 +534,19 @@ def _instability(
     else:
         sentence = "The first instability on the path is at {}: a {}, {}."
     return Markup(sentence).format(load, kind, displacement + _place_of_mode(mode_at, summary))
+
+
+def _errors_of_load(line: Line, summary: Summary) -> dict[str, float]:
+    """Return column -> estimated error of the load at the first instability, also in units.
+
+    It is empty without an estimate. `line` is the row of the instability.
+    """
+    name = amplitude(line["amplitude"]).column
+    error, shown = summary.get("errors", {}).get("limit_load"), shown_quantity(name, line).name
+    if error is None:
+        return {}
+    ratio = float(line[shown]) / float(line[name]) if float(line[name]) else 0.0
+    return {shown: abs(ratio) * error, name: error}
 
 
 def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:
@@ -573,8 +605,15 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     arrived = last_line["label"] in ("target", "field") and not summary["stopped"]
     subject = "The run reached its target" if arrived else "The last point"
     pole = pole_name(last_line, pole_of(summary["case"]))
+    errors = dict[str, float]()
+    if last_line is [line for line in lines if line["branch"] == "0"][-1]:
+        errors = {
+            name.removesuffix(END): error
+            for name, error in summary.get("errors", {}).items()
+            if name.endswith(END)
+        }
     sentence = Markup("{}: {}, {}.").format(
-        subject, value(last_line, summary), _displacement(last_line, pole, lines)
+        subject, value(last_line, summary, errors), _displacement(last_line, pole, lines, errors)
     )
     return sentence + _untouched(last_line)
 
@@ -597,7 +636,9 @@ def _untouched(line: Line) -> Markup:
     )
 
 
-def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
+def _displacement(
+    line: Line, pole: str, lines: Sequence[Line], errors: Mapping[str, float] = NO_ERRORS
+) -> Markup:
     """Return in words the displacement at a point of a path, and the force on what moves.
 
     Parameters
@@ -608,10 +649,12 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
         Name of the point of w_pole_over_h.
     lines
         All rows; they show which numbers are as small as rounding.
+    errors
+        Column -> its estimated error at the point.
     """
     varied_amplitude = amplitude(line["amplitude"])
     at_pole = Markup("{} at {}").format(
-        _named_amount(shown_quantity("w_pole_over_h", line), line, lines), pole
+        _named_amount(shown_quantity("w_pole_over_h", line), line, lines, errors), pole
     )
     # those axes of the curve that show a force
     force_axes = [
@@ -621,31 +664,37 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     ]
     # the load has been said already; if a displacement is prescribed, the force is of interest
     if force_axes and varied_amplitude.column != "force":
-        return Markup("{}, {}").format(_named_amount(force_axes[0], line, lines), at_pole)
+        return Markup("{}, {}").format(_named_amount(force_axes[0], line, lines, errors), at_pole)
     # the displacement at the load is of interest, if the load is not at the pole
     is_at_load = varied_amplitude.conjugate == "w_over_h"
     if is_at_load and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} {}").format(
-            _named_amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
+            _named_amount(shown_quantity("w_over_h", line), line, lines, errors),
+            varied_amplitude.place,
         )
     return at_pole
 
 
-def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
+def amount(
+    name: str, line: Line, lines: Sequence[Line], errors: Mapping[str, float] = NO_ERRORS
+) -> Markup:
     """Return the number in column `name` of a row, zero where it is as small as rounding.
 
-    The largest number of the column in all `lines` sets what is small.
+    The largest number of the column in all `lines` sets what is small. `errors` are estimated
+    errors by column.
     """
-    return number(
-        above_rounding(float(line[name]), (float(other_line[name]) for other_line in lines))
-    )
+    value = above_rounding(float(line[name]), (float(other_line[name]) for other_line in lines))
+    return number(value, error=errors.get(name) if value else None)
 
 
-def _named_amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
+def _named_amount(
+    of_column: Quantity, line: Line, lines: Sequence[Line], errors: Mapping[str, float] = NO_ERRORS
+) -> Markup:
     """Return symbol, value and unit of a column at a point, such as "w/h = 0.5".
 
-    The value is zero where it is as small as rounding over the largest one in all `lines`.
+    The value is zero where it is as small as rounding over the largest one in all `lines`. `errors`
+    are estimated errors by column.
     """
-    cell = amount(of_column.name, line, lines)
+    cell = amount(of_column.name, line, lines, errors)
     unit = f" {of_column.shown_unit}" if of_column.shown_unit else ""
     return Markup("{} = {}{}").format(head(of_column), cell, unit)

@@ -50,6 +50,7 @@ SUMMARY_TYPES: dict[str, Any] = {
     "gradients?": {"*": {"value": NUMBER_TYPES, "numbers": ALL_NUMBERS, "fields": dict}},
     "knockdown": (*NUMBER_TYPES, NONE_TYPE),
     "barrier?": (*NUMBER_TYPES, NONE_TYPE),
+    "errors?": ALL_NUMBERS,
     "snaps?": [dict.fromkeys(("time", "departure?", "jump?", "overshoot"), NUMBER_TYPES)],
     **dict.fromkeys(("snap_time_ms?", "snap_departure_ms?", "snap_jump_ms?"), NUMBER_TYPES),
     "solutions?": [{"point": int, "stable": bool, "residual": NUMBER_TYPES}],

@@ -1,0 +1,452 @@
+"""Errors of the discretisation in the results of a run, by one degree more on the same mesh.
+
+A result is computed again with elements of one degree more, from the state of the run by Newton's
+method, without its path. The change of the result, times `SAFETY`, estimates its error. At a target
+the equilibrium is solved with the same load, or the same conjugate; a fold is located again; where
+a mode is neutral, the eigenvalue nearest to zero and its slope along the path tell where it is.
+
+Words and symbols:
+
+- The fine scene has the mesh of the coarse one, that of the run, and one degree more. Each field of
+  the coarse scene is one of the fine scene: to raise its degree is exact.
+- An amplitude mu is a load parameter; its conjugate -dPi/dmu is the displacement on which it does
+  work. What a step holds or prescribes keeps its value.
+- A stage is a scene with the solver of one step; `enter` and `leave` convert states of the model to
+  states of the step's system and back.
+- A located record is a fold or a bifurcation. A family has modes that share a tangent; a model with
+  symmetry excludes families of modes.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import isfinite
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from magshell_fenicsx.continuation.control import (
+    ConstraintRow,
+    PrescribedConjugate,
+    PrescribedLoad,
+)
+from magshell_fenicsx.continuation.fold import (
+    AugmentedTangent,
+    FoldGuess,
+    FoldLost,
+    find_fold,
+    first_difference,
+    held_along,
+    third_derivative,
+)
+from magshell_fenicsx.continuation.modes import (
+    ModesNotFound,
+    NoEigenpair,
+    critical_mode,
+    nearest_to_zero,
+)
+from magshell_fenicsx.continuation.stability_monitor import ModeFamily
+from magshell_fenicsx.continuation.system import State, Vector, dot, symmetric_part
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.shells.waves import WaveFamily
+from magshell_fenicsx.simulate.adapt.ending import History, at_target
+from magshell_fenicsx.simulate.adapt.tolerance import SAFETY
+from magshell_fenicsx.simulate.contact_control import with_cuts_here
+from magshell_fenicsx.simulate.path_records import LOCATED
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.results import barrier
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
+from magshell_fenicsx.simulate.stage import Stage, load_stage
+from magshell_fenicsx.simulate.steps import stage_of_step
+
+SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue along the path
+ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
+MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
+FAILURES = (
+    CaseError,
+    MeshError,
+    Stopped,
+    FoldLost,
+    NoEigenpair,
+    ModesNotFound,
+    np.linalg.LinAlgError,
+    PETSc.Error,
+)
+
+
+class NotEstimated(RuntimeError):
+    """A result has no estimate of its error; the message says why."""
+
+
+@dataclass
+class ErrorEstimates:
+    """Estimated errors of the results of a run.
+
+    Attributes
+    ----------
+    errors
+        Name of a result -> its estimated absolute error. Names are "knockdown" and
+        "critical_field", "limit_load" (the first value of `limit_points`), and COLUMN@end, a column
+        of path.csv at the last point.
+    reasons
+        Name of a result, "end" for all at the last point -> why it has no estimate.
+    """
+
+    errors: dict[str, float] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    @contextmanager
+    def naming(self, *names: str) -> Iterator[None]:
+        """Note the reason for some results where their estimate fails inside `with`."""
+        try:
+            yield
+        except (NotEstimated, *FAILURES) as e:
+            self.reasons |= dict.fromkeys(names, str(e) or type(e).__name__)
+
+
+def estimate_errors(scene: Scene, history: History) -> ErrorEstimates:
+    """Return the estimated errors of the results of a run; collective.
+
+    Parameters
+    ----------
+    scene
+        The first scene of the run.
+    history
+        The records of the run.
+    """
+    estimates, fine_scenes = ErrorEstimates(), _FineScenes()
+    for record, columns in _instabilities(scene, history):
+        with estimates.naming(*columns):
+            changes = fine_scenes.comparison(scene, record).changes
+            estimates.errors |= {
+                name: _estimated(changes[column], record.point.load_error)
+                for name, column in columns.items()
+            }
+    end = history.end
+    if end and end.amplitude:
+        with estimates.naming("end"):
+            changes = fine_scenes.comparison(scene, end).changes
+            estimates.errors |= {
+                f"{column}@end": _estimated(change) for column, change in changes.items() if change
+            }
+    steps = scene.problem.programme
+    if steps and steps[-1].until == "zero" and history.begin and history.last:
+        with estimates.naming("barrier"):
+            begin, last = (
+                fine_scenes.comparison(scene, record) for record in (history.begin, history.last)
+            )
+            if begin.fine is not last.fine:
+                raise NotEstimated("its begin is in another model")
+            change = last.barrier_from(begin)
+            estimates.errors["barrier"] = _estimated(change)
+    return estimates
+
+
+def _estimated(change: float, load_error: float = 0.0) -> float:
+    """Return the error of a number that one degree more changes, with that of the solver."""
+    return SAFETY * abs(change) + load_error
+
+
+def _instabilities(scene: Scene, history: History) -> list[tuple[Record, dict[str, str]]]:
+    """Return the instabilities that are results, each with name of the result -> its column."""
+    columns_of = dict[int, dict[str, str]]()
+    held = {step.number for step in scene.problem.programme if step.name in step.load.hold}
+    for name, mu in (("knockdown", "pressure"), ("critical_field", "lambda_m"), ("limit_load", "")):
+        for number, record in enumerate(history.located):
+            at_held_volume = name == "knockdown" and record.step in held
+            if mu in ("", record.amplitude) and not at_held_volume:
+                column = amplitude(record.amplitude).column
+                columns_of.setdefault(number, {})[name] = column
+                break
+    return [(history.located[number], columns) for number, columns in columns_of.items()]
+
+
+class _FineScenes:
+    """Fine scenes of the scenes of a run, and the comparisons at its records, each made once."""
+
+    def __init__(self) -> None:
+        self._scenes = dict[int, Scene]()
+        self._comparisons = dict[int, Comparison]()
+
+    def comparison(self, first_scene: Scene, record: Record) -> "Comparison":
+        """Return the comparison at a record; collective.
+
+        Raises
+        ------
+        NotEstimated, CaseError, MeshError
+            If there is none.
+        """
+        if id(record) not in self._comparisons:
+            scene = record.scene or first_scene
+            _refuse(scene, record)
+            if id(scene) not in self._scenes:
+                self._scenes[id(scene)] = fine_scene(scene)
+            self._comparisons[id(record)] = Comparison(scene, self._scenes[id(scene)], record)
+        return self._comparisons[id(record)]
+
+
+def _refuse(scene: Scene, record: Record) -> None:
+    """Check that the state of a record can be computed with one degree more.
+
+    Raises
+    ------
+    NotEstimated
+        If it cannot.
+    """
+    problem = scene.problem
+    if problem.body:
+        raise NotEstimated("a solid has one degree alone; mesh.tolerance estimates its error")
+    if record.amplitude == "time":
+        raise NotEstimated("the state depends on a motion before it")
+    if problem.loads.interaction:
+        raise NotEstimated("the field of the shell's own magnets takes too long")
+    step = problem.programme[record.step - 1] if record.step else None
+    if step and step.name in step.load.hold:
+        raise NotEstimated("the conjugate of its load is held")
+
+
+def fine_scene(scene: Scene) -> Scene:
+    """Return the scene on the same mesh with one degree more; collective.
+
+    Raises
+    ------
+    CaseError
+        If both do not fit into memory together.
+    NotEstimated
+        If the cells of the mesh are in another order.
+    """
+    problem, degree = problem_on_mesh_of(scene, scene.problem), scene.model.degree
+    mesh = problem.mesh.model_copy(update={"degree": degree + 1})
+    # those of both scenes, which are in memory at once
+    unknowns = problem.unknowns * (1 + ((degree + 1) / degree) ** 2)
+    fine = Scene(replace(problem, mesh=mesh, unknowns=unknowns), scene.comm)
+    cells, fine_cells = (s.model.V.mesh.topology.original_cell_index for s in (scene, fine))
+    if not scene.comm.allreduce(np.array_equal(cells, fine_cells), MPI.LAND):
+        raise NotEstimated("the cells of the mesh are in another order")
+    return fine
+
+
+def with_higher_degree(source: Scene, target: Scene, u: Vector) -> Vector:
+    """Return a displacement of a scene in the unknowns of its fine scene; collective.
+
+    It is zero at supports.
+    """
+    V, W = source.model.V, target.model.V
+    # in each cell: the polynomials of the source at the nodes of the target
+    nodes = W.element.basix_element.points
+    table = V.element.basix_element.tabulate(0, nodes)[0, :, :, 0]
+    values = source.model.system.with_ghosts(u).reshape(-1, V.dofmap.bs)[V.dofmap.list]
+    raised = np.zeros((W.dofmap.index_map.size_local + W.dofmap.index_map.num_ghosts, W.dofmap.bs))
+    raised[W.dofmap.list] = np.einsum("qp,npc->nqc", table, values)
+    return target.model.system.zero_at_supports(raised.ravel()[: target.model.system.size])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A point of a run, and the same point with one degree more.
+
+    Attributes
+    ----------
+    scene, fine
+        The scene of the point, and its fine scene.
+    record
+        The point.
+    """
+
+    scene: Scene
+    fine: Scene
+    record: Record
+
+    @cached_property
+    def changes(self) -> dict[str, float]:
+        """Column of path.csv -> its change by one degree more; collective.
+
+        Columns in units are among them.
+
+        Raises
+        ------
+        NotEstimated, FoldLost, NoEigenpair, LinAlgError
+            If the point is not found with one degree more.
+        """
+        before = self.scene.observe(self.record.point.state)
+        after = self.fine.observe(self.state)
+        changes = {
+            column: after[column] - value
+            for column, value in before.items()
+            if isfinite(value) and max(abs(value), abs(after[column])) > ROUNDING
+        }
+        return changes | self.scene.sizes.values(changes)
+
+    def barrier_from(self, begin: "Comparison") -> float:
+        """Return the change of the barrier of the last step, by one degree more; collective.
+
+        Parameters
+        ----------
+        begin
+            The comparison where the step begins.
+        """
+        step = self.scene.problem.programme[self.record.step - 1]
+        states = begin.record.point.state, self.record.point.state
+        before = barrier(self.scene, step, *states)
+        return barrier(self.fine, step, begin.state, self.state) - before
+
+    @cached_property
+    def state(self) -> State:
+        """State of the fine scene at the point; collective."""
+        if not self.record.amplitude:  # the undeformed shell
+            return State(self.fine.model.zero(), dict(self.record.point.state.mu))
+        if self.record.label not in LOCATED:
+            stage, state, _ = self._equilibrium()
+            return stage.leave(state)
+        if self.record.mode in OWN_MODES:
+            return self._fold() if self.record.label == "fold" else self._own_bifurcation()
+        return self._excluded_bifurcation()
+
+    def _stage(self) -> tuple[Stage, State]:
+        """Return the stage of the record's step on the fine scene, and the state as a guess.
+
+        What the step holds has the value of the record.
+        """
+        fine, record = self.fine, self.record
+        u = with_higher_degree(self.scene, fine, record.point.state.u)
+        # cuts belong to the mesh and the degree
+        guess = with_cuts_here(fine, State(u, dict(record.point.state.mu)))
+        stage = load_stage(fine)
+        if record.step:
+            stage = stage_of_step(fine, fine.problem.programme[record.step - 1], guess)
+        return stage, stage.enter(guess)
+
+    def _equilibrium(self) -> tuple[Stage, State, ConstraintRow]:
+        """Return stage and state of the equilibrium near the record, and what is prescribed there.
+
+        Raises
+        ------
+        NotEstimated
+            If Newton's method finds none.
+        """
+        stage, guess = self._stage()
+        name, by_conjugate = self.record.amplitude, False
+        if self.record.step and self.record.label not in LOCATED:
+            end = at_target(self.scene, self.record)
+            is_unloaded = self.fine.problem.programme[self.record.step - 1].until == "zero"
+            name, by_conjugate = end.name, end.held is not None and not is_unloaded
+        system = stage.newton.system
+        row: ConstraintRow = PrescribedLoad(name, guess.mu[name])
+        if by_conjugate:
+            held_value = -system.potential(guess.u, guess.mu, name)
+            row = PrescribedConjugate(system, name, held_value)
+        outcome = stage.newton.solve(guess, name, row)
+        if not outcome.converged:
+            raise NotEstimated(f"with one degree more: {outcome.reason}")
+        return stage, outcome.state, row
+
+    def _fold(self) -> State:
+        """Return the state at the fold near the record."""
+        stage, guess = self._stage()
+        du = with_higher_degree(self.scene, self.fine, self.record.point.du)
+        phi = stage.padded(du)
+        fold = find_fold(stage.newton, FoldGuess(guess, phi), self.record.amplitude)
+        _refuse_other_mode(stage, phi, fold.phi)
+        return stage.leave(fold.state)
+
+    def _own_bifurcation(self) -> State:
+        """Return the state where a mode of the model itself is neutral, near the record.
+
+        A force along the mode keeps the state on the path. With the bordered tangent K v + g b = 0,
+        b . v = 1, one step of Newton's method for g = 0 along the path follows.
+
+        Raises
+        ------
+        NotEstimated
+            If the load changes along the branch.
+        """
+        if self.record.mode == "asymmetric":
+            raise NotEstimated("a bifurcation at which the load changes along the branch")
+        stage, guess = self._stage()
+        newton, name = stage.newton, self.record.amplitude
+        b = critical_mode(newton, guess).vector
+        held_state = held_along(newton, guess, b)
+        if held_state is None:
+            raise NotEstimated("with one degree more Newton's method finds no equilibrium")
+        state, _ = held_state
+        system, tangent = newton.system, AugmentedTangent(newton, state, b)
+        w_mu, _ = tangent.solve(system.load(state.u, state.mu, name))
+        cubic = third_derivative(system, state, tangent.v)
+        K_mu_v = first_difference(
+            lambda u: system.load(u, state.mu, name), system, state.u, tangent.v
+        )
+        slope = dot(system.comm, cubic, w_mu) - dot(system.comm, tangent.v, K_mu_v)
+        dmu = -tangent.g / slope
+        return stage.leave(state.with_(state.u - dmu * w_mu, name, state.mu[name] + dmu))
+
+    def _excluded_bifurcation(self) -> State:
+        """Return the state where a mode that the model excludes is neutral, near the record.
+
+        Raises
+        ------
+        NotEstimated
+            If the modes have no tangent of their own, or the eigenvalue does not change.
+        """
+        stage, state, row = self._equilibrium()
+        name, mu = self.record.amplitude, state.mu[self.record.amplitude]
+        response = stage.newton.response(state, name, row)
+        family = _family(self.fine, self.record.mode)
+        eigenvalue, v = nearest_to_zero(family.factor_at(stage.leave(state)))
+
+        def moved(dmu: float) -> State:
+            """Return the state of the model further along the path."""
+            return stage.leave(state.with_(state.u + dmu * response.du, name, mu + dmu))
+
+        step = SLOPE_STEP * (abs(mu) or 1.0)
+        product = _tangent_times(family, moved(step), v)
+        slope = (dot(self.fine.comm, v, product) - eigenvalue) / step
+        return moved(-eigenvalue / slope)
+
+
+def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:
+    """Check that a mode is the same with one degree more; collective.
+
+    Raises
+    ------
+    NotEstimated
+        If the two are far from parallel.
+    """
+    u, v = (stage.displacement(x) for x in (phi, fine_phi))
+    comm = stage.scene.comm
+    if dot(comm, u, v) ** 2 < MIN_COSINE**2 * dot(comm, u, u) * dot(comm, v, v):
+        raise NotEstimated("with one degree more the instability near by has another mode")
+
+
+def _family(scene: Scene, label: str) -> ModeFamily:
+    """Return the family of modes with a label that a model excludes.
+
+    Raises
+    ------
+    NotEstimated
+        If the model has none.
+    """
+    modes = scene.model.symmetry_breaking_modes
+    families = modes.families if modes else ()
+    family = next((each for each in families if each.label == label), None)
+    if family is None:
+        raise NotEstimated(f"the model has no tangent of its modes {label}")
+    return family
+
+
+def _tangent_times(family: ModeFamily, state: State, v: Vector) -> Vector:
+    """Return the tangent of a family at a state, times a vector; collective."""
+    if isinstance(family, WaveFamily):
+        K = family.waves.tangent(state, family.m)
+    else:
+        assert isinstance(family, AntisymmetricModes)
+        K = symmetric_part(family.system.tangent(state.u, state.mu))
+    x, y = K.createVecs()
+    x.setArray(v)
+    K.mult(x, y)
+    return np.array(y.array_r)

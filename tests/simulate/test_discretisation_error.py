@@ -1,0 +1,120 @@
+"""Estimated errors of results against true ones, which finer meshes of higher degree give.
+
+References: refinement 2 and degree 5 of this program, except where another source is named.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES
+from mpi4py import MPI
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.public import Result, Scene, run
+from magshell_fenicsx.simulate.discretisation_error import fine_scene, with_higher_degree
+
+COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
+POLE = [*COARSE, "loading.depth=2", "loading.points=2"]
+
+
+def coarse_run(file: str, *settings: str) -> Result:
+    return run(Case.load(CASES / file, [*COARSE, *settings]))
+
+
+def check_effectivity(result: Result, name: str, value: float, reference: float) -> None:
+    """The estimate is the true error within a factor of three."""
+    true_error = abs(value - reference)
+    assert true_error > 1e-9 * abs(reference)
+    assert 0.3 < result.errors[name] / true_error < 3
+
+
+def test_fold_of_a_meridian() -> None:
+    """k_d of an independent axisymmetric solver, nine digits."""
+    result = coarse_run("dimple_buckling.yaml")
+    assert result.knockdown
+    check_effectivity(result, "knockdown", result.knockdown, 0.326233289)
+    assert result.errors["limit_load"] == result.errors["knockdown"]
+    assert not result.error_estimates.reasons
+
+
+def test_fold_of_half_a_shell() -> None:
+    """The same, 1 % off; the relative error is large enough for a warning."""
+    result = coarse_run("dimple_buckling.yaml", "symmetry=half")
+    assert result.knockdown
+    check_effectivity(result, "knockdown", result.knockdown, 0.326233289)
+    assert result.large_errors["knockdown"] == pytest.approx(0.012, abs=0.001)
+
+
+def test_waves_that_a_meridian_excludes() -> None:
+    result = coarse_run("cylinder_waves.yaml")
+    assert result.knockdown
+    check_effectivity(result, "knockdown", result.knockdown, 0.113753163)
+
+
+def test_force_at_a_depth() -> None:
+    """What the step prescribes has no error, and what follows has one."""
+    result = run(Case.load(CASES / "pole_indentation.yaml", POLE))
+    last = result.rows[-1]
+    check_effectivity(result, "force@end", float(last["force"]), 3.32861271)
+    check_effectivity(result, "energy@end", float(last["energy"]), -2.2227381e-6)
+    assert result.errors.get("w_over_h@end", 0.0) < 1e-12
+
+
+def test_critical_field_and_displacement_beyond_it() -> None:
+    result = coarse_run("bistable_dome.yaml")
+    assert result.critical_field
+    check_effectivity(result, "critical_field", result.critical_field, -0.0236453674)
+    check_effectivity(result, "w_mm@end", float(result.rows[-1]["w_mm"]), 5.1236557)
+    field = result.errors["critical_field"] / abs(result.critical_field)
+    in_units = result.errors["critical_field_mT"] / 363.17
+    assert in_units == pytest.approx(field, rel=1e-3)
+
+
+def test_what_has_no_estimate_says_why() -> None:
+    settings = ["mesh.refinement=0.3", "shell.radius_to_thickness=20", "loading.points=1"]
+    result = run(
+        Case.load(CASES / "solid_indentation.yaml", [*settings, "loading.depth=1"]),
+    )
+    assert result.errors == {}
+    reason = "a solid has one degree alone; mesh.tolerance estimates its error"
+    assert result.error_estimates.reasons == {"end": reason}
+
+
+@pytest.mark.parametrize("symmetry", ["auto", "half"])
+def test_a_field_of_the_run_is_one_of_the_fine_scene(symmetry: str) -> None:
+    """A cubic displacement has the same energy with one degree more, to the error of quadrature."""
+    case = Case.load(CASES / "dimple_buckling.yaml", [*COARSE, f"symmetry={symmetry}"])
+    scene = Scene(case.problem(), MPI.COMM_SELF)
+    fine, state = fine_scene(scene), scene.unloaded()
+    u = scene.model.system.zero_at_supports(np.sin(np.arange(state.u.size) / 50) * 1e-4)
+    raised = with_higher_degree(scene, fine, u)
+    volumes = [
+        -each.model.system.potential(v, state.mu, "pressure")
+        for each, v in ((scene, u), (fine, raised))
+    ]
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-6)
+
+
+def test_same_on_two_ranks_and_resumed(tmp_path: Path) -> None:
+    """summary.json of two ranks, and of a run that stops and goes on, has the same errors."""
+    case = CASES / "dimple_buckling.yaml"
+    settings = [f"--set={setting}" for setting in (*COARSE, "symmetry=half")]
+    errors = dict[str, dict[str, float]]()
+    for name, ranks in (("one", 0), ("two", 2)):
+        out = tmp_path / name
+        done = magshell("run", case, *settings, "--no-pictures", "--out", out, ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        errors[name] = json.loads((out / "summary.json").read_text())["errors"]
+        assert "k_d = 0.330(4)" in done.stdout
+        assert "warning: the estimated error of knockdown is 1.2 % of it" in done.stdout
+    assert errors["two"]["knockdown"] == pytest.approx(errors["one"]["knockdown"], rel=1e-5)
+    out = tmp_path / "resumed"
+    words = ("run", case, *settings, "--no-pictures", "--out", out)
+    assert magshell(*words, "--time-limit", 0).returncode == 3
+    assert json.loads((out / "summary.json").read_text())["errors"] == {}
+    assert magshell(*words, "--resume").returncode == 0
+    resumed = json.loads((out / "summary.json").read_text())["errors"]
+    assert resumed == errors["one"]
