@@ -4,12 +4,12 @@ A shell that keeps its volume gets thinner as its surface stretches. A natural s
 grown without stress, and its volume stays. Penetrations and thicknesses are over R, stiffnesses
 over E h/R^2, with Young's modulus E, thickness h and reference length R. docs/theory.md, Contact.
 
-psi(s) is the penalty energy per area of a penetration s; psi' is the contact pressure. A jet is a
-map with its derivatives at a point. A memo is a value that is computed again where its inputs have
-changed. An amplitude is a load parameter.
+A jet is a map with its derivatives at a point. A memo is a value that is computed again where its
+inputs have changed. An amplitude is a load parameter.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -133,71 +133,84 @@ def thickness_ratio_at_points(
     return ratio_at
 
 
-def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, Array]:
-    """Return the penalty energy psi per area of penetrations s, with both derivatives.
+@dataclass(frozen=True)
+class Penalty:
+    """The penalty energy psi(s) per area of a penetration s; psi' is the contact pressure.
 
-    psi'' grows linearly from 0 to k over the penetration `soft_penetration`, and is then constant.
-    Without penetration (s <= 0) all are zero. The three arrays have the shape of s.
+    psi'' grows linearly from 0 to the stiffness over the soft penetration, and is then constant.
+
+    Attributes
+    ----------
+    stiffness
+        k, over E h/R^2.
+    soft_penetration
+        Over R.
     """
-    t = np.maximum(s, 0.0)
-    # up to the soft penetration psi is a cubic; beyond, psi'' is k, and the constants make psi and
-    # psi' continuous
-    is_full = t > soft_penetration
-    second = np.where(is_full, k, k * t / soft_penetration)
-    first = np.where(is_full, k * (t - soft_penetration / 2), k * t**2 / (2 * soft_penetration))
-    value = np.where(
-        is_full,
-        k * (t**2 / 2 - t * soft_penetration / 2 + soft_penetration**2 / 6),
-        k * t**3 / (6 * soft_penetration),
-    )
-    return value, first, second
 
+    stiffness: float
+    soft_penetration: float
 
-def expanded_penalty(
-    s: Array, s0: Array, k: float, soft_penetration: float, *, with_third_order: bool = False
-) -> tuple[Array, Array, Array]:
-    """Return the Taylor polynomial of the penalty energy about s0, with both derivatives.
+    def derivatives(self, s: Array) -> tuple[Array, Array, Array]:
+        """Return psi, psi' and psi'' at penetrations s, of their shape.
 
-    The energy psi(s) is that of `penalty`. The polynomial is of the second order, or of the third
-    `with_third_order`. The second order is better for differences over a part of
-    `soft_penetration`. The third order is needed where psi'' itself is differentiated.
+        Without penetration (s <= 0) all are zero.
+        """
+        k, soft_penetration, t = self.stiffness, self.soft_penetration, np.maximum(s, 0.0)
+        # up to the soft penetration psi is a cubic; beyond, psi'' is k, and the constants make psi
+        # and psi' continuous
+        is_full = t > soft_penetration
+        second = np.where(is_full, k, k * t / soft_penetration)
+        first = np.where(is_full, k * (t - soft_penetration / 2), k * t**2 / (2 * soft_penetration))
+        value = np.where(
+            is_full,
+            k * (t**2 / 2 - t * soft_penetration / 2 + soft_penetration**2 / 6),
+            k * t**3 / (6 * soft_penetration),
+        )
+        return value, first, second
 
-    Returns
-    -------
-    tuple
-        psi, psi' and psi'' at the penetrations s, of the shape of s.
-    """
-    value, first, second = penalty(s0, k, soft_penetration)  # psi, psi' and psi'' at s0
-    step = s - s0
-    # psi''' is zero where psi'' is constant: without penetration, and beyond the soft one
-    third = with_third_order * np.where(
-        (s0 > 0) & (s0 <= soft_penetration), k / soft_penetration, 0.0
-    )
-    second_at_s = second + step * third
-    return (
-        value + step * (first + step * (second / 2 + step / 6 * third)),
-        first + step * (second + second_at_s) / 2,
-        second_at_s,
-    )
+    def expanded(
+        self, s: Array, s0: Array, *, with_third_order: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """Return the Taylor polynomial of psi about s0, with both derivatives, at penetrations s.
 
+        It is of the second order, or of the third `with_third_order`. The second order is better
+        for differences over a part of the soft penetration. The third order is needed where psi''
+        itself is differentiated.
+        """
+        value, first, second = self.derivatives(s0)
+        step = s - s0
+        # psi''' is zero where psi'' is constant: without penetration, and beyond the soft one
+        third = with_third_order * np.where(
+            (s0 > 0) & (s0 <= self.soft_penetration), self.stiffness / self.soft_penetration, 0.0
+        )
+        second_at_s = second + step * third
+        return (
+            value + step * (first + step * (second / 2 + step / 6 * third)),
+            first + step * (second + second_at_s) / 2,
+            second_at_s,
+        )
 
-def mean_pressure(s0: Array, s1: Array, k: float, soft_penetration: float) -> tuple[Array, Array]:
-    """Return the mean pressure (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
+    def segments(self, s: Array) -> NDArray[np.int64]:
+        """Return where penetrations are among the kinks of psi'': 0 open, 1 soft, 2 beyond."""
+        return np.digitize(s, (0.0, self.soft_penetration))
 
-    It is the pressure over a step of penetration from s0 to s1 that conserves energy. Between the
-    kinks of psi'' the pressure psi' is a polynomial. Simpson's rule then gives its mean exactly,
-    and needs no division by s1 - s0, which may be zero. Steps over a kink take the quotient.
-    """
-    # psi, psi' and psi'' at both penetrations, and in the middle
-    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft_penetration), penalty(s1, k, soft_penetration)
-    _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft_penetration)
-    # Simpson's rule, and its derivative by s1
-    simpson, simpson_slope = (p0 + 4 * p_middle + p1) / 6, (2 * k_middle + k1) / 6
-    # the quotient where a step passes a kink; over a tiny step it would be rounding, and Simpson's
-    # rule is good enough
-    kinks = (0.0, soft_penetration)
-    takes_quotient = np.digitize(s0, kinks) != np.digitize(s1, kinks)
-    takes_quotient &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft_penetration
-    ds = np.where(takes_quotient, s1 - s0, 1.0)  # 1 where the quotient is not used
-    mean = np.where(takes_quotient, (v1 - v0) / ds, simpson)
-    return mean, np.where(takes_quotient, (p1 - mean) / ds, simpson_slope)
+    def mean_pressure(self, s0: Array, s1: Array) -> tuple[Array, Array]:
+        """Return the mean pressure (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
+
+        It is the pressure over a step of penetration from s0 to s1 that conserves energy. Between
+        the kinks of psi'' the pressure psi' is a polynomial. Simpson's rule then gives its mean
+        exactly, and needs no division by s1 - s0, which may be zero. Steps over a kink take the
+        quotient.
+        """
+        # psi, psi' and psi'' at both penetrations, and in the middle
+        (v0, p0, _), (v1, p1, k1) = self.derivatives(s0), self.derivatives(s1)
+        _, p_middle, k_middle = self.derivatives((s0 + s1) / 2)
+        # Simpson's rule, and its derivative by s1
+        simpson, simpson_slope = (p0 + 4 * p_middle + p1) / 6, (2 * k_middle + k1) / 6
+        # the quotient where a step passes a kink; over a tiny step it would be rounding, and
+        # Simpson's rule is good enough
+        takes_quotient = self.segments(s0) != self.segments(s1)
+        takes_quotient &= np.abs(s1 - s0) > PENETRATION_ROUNDING * self.soft_penetration
+        ds = np.where(takes_quotient, s1 - s0, 1.0)  # 1 where the quotient is not used
+        mean = np.where(takes_quotient, (v1 - v0) / ds, simpson)
+        return mean, np.where(takes_quotient, (p1 - mean) / ds, simpson_slope)

@@ -14,6 +14,8 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION, Penalty
+
 Array = NDArray[np.float64]
 Configuration = TypeVar("Configuration")
 Frozen = TypeVar("Frozen")
@@ -75,11 +77,22 @@ class PenaltyContact(ABC, Generic[Configuration, Frozen]):
         Share of the allowed penetration up to which the points of the contact may penetrate.
     ends_steps
         Whether steps of a path end where the contact closes.
+    stiffness
+        Stiffness k of the penalty, over E h/R^2: a number that a state sets.
+
+    The field `_h` is the thickness over R.
     """
 
     max_stiffening: ClassVar[float]
     bound_at_points: ClassVar[float] = 1.0
     ends_steps: ClassVar[bool] = True
+    stiffness: Any
+    _h: float
+
+    @property
+    def penalty(self) -> Penalty:
+        """The penalty with the present stiffness."""
+        return Penalty(float(self.stiffness.value), SOFT_PENETRATION * self._h)
 
     @property
     @abstractmethod

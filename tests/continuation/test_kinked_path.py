@@ -16,7 +16,7 @@ from magshell_fenicsx.continuation.point import Point, StepOptions
 from magshell_fenicsx.continuation.snes import NewtonOptions
 from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.parts.gap import penalty
+from magshell_fenicsx.parts.gap import Penalty
 
 K, X, STIFF, SOFT, DEEP = 2.0, 0.8, 1e5, 1e-5, 1e-4
 
@@ -28,11 +28,11 @@ def f(x: float) -> float:
 def stop() -> Toy:
     def gradient(u: Vector) -> Vector:
         q, x = u
-        pressed = penalty(np.array([x - X]), STIFF, SOFT)[1][0]
+        pressed = Penalty(STIFF, SOFT).derivatives(np.array([x - X]))[1][0]
         return np.array([K * (q - x), f(x) - K * (q - x) + pressed])
 
     def hessian(u: Vector) -> Vector:
-        stiff = penalty(np.array([u[1] - X]), STIFF, SOFT)[2][0]
+        stiff = Penalty(STIFF, SOFT).derivatives(np.array([u[1] - X]))[2][0]
         return np.array([[K, -K], [-K, 3 * u[1] ** 2 - 6 * u[1] + 2 + K + stiff]])
 
     return Toy(gradient, hessian, 2)
@@ -46,7 +46,7 @@ def rows_of_stops(places: list[float]) -> Toy:
     """
 
     def forces(x: float) -> tuple[float, float]:
-        _, pressed, stiff = penalty(x - np.array(places), 3.0, 1e-9)
+        _, pressed, stiff = Penalty(3.0, 1e-9).derivatives(x - np.array(places))
         return float(np.sum(pressed)), float(np.sum(stiff))
 
     def gradient(u: Vector) -> Vector:
@@ -99,7 +99,7 @@ def test_a_path_goes_on_where_its_load_turns_at_a_stop(first: float) -> None:
     assert passed[-1][0] == "target"
     assert passed[-1][1].negative_pivots == 0
     assert q == pytest.approx(X + 0.6 / K, abs=1e-4)
-    pressed = penalty(np.array([x - X]), STIFF, SOFT)[1][0]
+    pressed = Penalty(STIFF, SOFT).derivatives(np.array([x - X]))[1][0]
     assert pressed == pytest.approx(0.6 - f(X), rel=1e-4), "the stop bears what the spring does not"
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.gap import penalty
+from magshell_fenicsx.parts.gap import Penalty
 from magshell_fenicsx.simulate.contacts_in_time import ContactsInTime
 from magshell_fenicsx.simulate.follow import follow
 
@@ -156,8 +156,8 @@ def test_penalty() -> None:
     the soft part.
     """
     s = np.array([-1e-3, 2e-4, 8e-4, 9.99e-4, 1.001e-3, 5e-3])
-    value, first, second = penalty(s, 3.0, 1e-3)
-    low, high = (penalty(s + side, 3.0, 1e-3) for side in (-1e-7, 1e-7))
+    value, first, second = Penalty(3.0, 1e-3).derivatives(s)
+    low, high = (Penalty(3.0, 1e-3).derivatives(s + side) for side in (-1e-7, 1e-7))
     assert value[0] == first[0] == second[0] == 0
     assert (high[0] - low[0]) / 2e-7 == pytest.approx(first, rel=1e-6, abs=1e-12)
     assert (high[1] - low[1]) / 2e-7 == pytest.approx(second, rel=1e-6, abs=1e-9)

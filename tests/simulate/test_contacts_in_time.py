@@ -7,7 +7,7 @@ import pytest
 from benchmarks.contacts_in_time import CASES, SMALL, apart, imbalance, moved
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.parts.gap import mean_pressure, penalty
+from magshell_fenicsx.parts.gap import Penalty
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import imbalances, rows
 from magshell_fenicsx.simulate.follow import follow
@@ -32,15 +32,15 @@ def found_of(
 
 def test_the_mean_pressure_times_the_change_of_penetration_is_that_of_the_energy() -> None:
     """Across the kinks of psi'' too; its derivative by differences."""
-    k, soft = 5.0, 0.1
+    penalty = Penalty(5.0, 0.1)
     s0, s1 = (
         x.ravel() for x in np.meshgrid(np.linspace(-0.31, 0.42, 12), np.linspace(-0.3, 0.4, 11))
     )
-    mean, slope = mean_pressure(s0, s1, k, soft)
+    mean, slope = penalty.mean_pressure(s0, s1)
     assert mean * (s1 - s0) == pytest.approx(
-        penalty(s1, k, soft)[0] - penalty(s0, k, soft)[0], abs=1e-15
+        penalty.derivatives(s1)[0] - penalty.derivatives(s0)[0], abs=1e-15
     )
-    ahead, behind = (mean_pressure(s0, s1 + step, k, soft)[0] for step in (1e-6, -1e-6))
+    ahead, behind = (penalty.mean_pressure(s0, s1 + step)[0] for step in (1e-6, -1e-6))
     assert slope == pytest.approx((ahead - behind) / 2e-6, abs=1e-5)
 
 

@@ -36,14 +36,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
-from magshell_fenicsx.parts.gap import (
-    SOFT_PENETRATION,
-    ThicknessRatio,
-    expanded_penalty,
-    mean_pressure,
-    penalty,
-    thickness_ratio,
-)
+from magshell_fenicsx.parts.gap import ThicknessRatio, thickness_ratio
 from magshell_fenicsx.parts.penalty_contact import (
     CROSSING_DISTANCE,
     GapAlongStep,
@@ -587,10 +580,7 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         gap, n, N = self._gap_memo.renew()
         expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
         is_pressed = expansion_gap < 0
-        k = float(self.stiffness.value)
-        penalties = expanded_penalty(
-            -gap[is_pressed], -expansion_gap[is_pressed], k, SOFT_PENETRATION * self._h
-        )
+        penalties = self.penalty.expanded(-gap[is_pressed], -expansion_gap[is_pressed])
         value, first, second = (derivative[:, None] for derivative in penalties)
         return _ActivePenalty(is_pressed, value, first, second, n[is_pressed], N[is_pressed])
 
@@ -674,8 +664,7 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         time integration: the change of the force over the step, times `part` - 1/2. See
         docs/theory.md, Motion.
         """
-        k, half = float(self.stiffness.value), self._h / 2
-        soft_penetration = SOFT_PENETRATION * self._h
+        penalty, half = self.penalty, self._h / 2
         # gaps with gradients n and Hessians N, each at the begin (0), middle (1) and end (2)
         middle = (begin.y + end.y) / 2, (begin.factor + end.factor) / 2
         states = (begin.y, begin.factor), middle, (end.y, end.factor)
@@ -685,9 +674,9 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         # that the derivative of the mean normal has the weights 4/6/2 and 1/6
         normal, mean_hessian = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
         # the mean pressure with its derivative by s1, then the pressures at both ends
-        mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
-        _, p0, _ = penalty(s0, k, soft_penetration)
-        _, p1, k1 = penalty(s1, k, soft_penetration)
+        mean_slope, mean_curvature = penalty.mean_pressure(s0, s1)
+        _, p0, _ = penalty.derivatives(s0)
+        _, p1, k1 = penalty.derivatives(s1)
         # psi by the place: the penetration has the gradient -n. The terms with off_middle are the
         # dissipative force; second derivatives are those by the end of the step alone
         off_middle = part - 0.5
@@ -753,7 +742,7 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         owned = slice(0, self._owned * len(self._points))
         gap = self.gap[owned]
         x, d = (self._placement_memo.renew() + self.place).reshape(-1, 3), self.contact.direction
-        _, pressure, _ = penalty(-gap, float(self.stiffness.value), SOFT_PENETRATION * self._h)
+        _, pressure, _ = self.penalty.derivatives(-gap)
         largest = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
         # distances of the pressed points from the axis through the front, along the approach
         from_front = x[owned] - self.contact.front

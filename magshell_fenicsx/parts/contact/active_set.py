@@ -26,7 +26,6 @@ from magshell_fenicsx.parts.contact.projection import JoinedPlaces, Longs, Proje
 from magshell_fenicsx.parts.contact.segments import ContactPoints
 
 Array = NDArray[np.float64]
-Penalty = tuple[Array, Array, Array]  # (m,) psi, psi' and psi'' of joined places, by penetrations
 Geometry = tuple[Array, Array, Array, Longs]
 """Of n places the distances (n,) of mid-surfaces, the normals (n, dim) from places to points, beta
 (n, functions of both cells): the shape functions of the point, minus those of the place, and the
@@ -54,7 +53,7 @@ class ActiveSet(Generic[Places]):
     points: ContactPoints | MeridianPoints
     places: Places
     joined_places: JoinedPlaces
-    penalties: Penalty
+    penalties: tuple[Array, Array, Array]
 
     @cached_property
     def area(self) -> Array:

@@ -32,7 +32,6 @@ from magshell_fenicsx.parts.contact.active_set import (
     ActiveSet,
     FrozenContact,
     Geometry,
-    Penalty,
     Places,
 )
 from magshell_fenicsx.parts.contact.closest_points import BLUR_DISTANCE, gap_between_supports
@@ -57,7 +56,6 @@ from magshell_fenicsx.parts.contact.time_averaging import (
     at_each_sample,
     samples_of_step,
 )
-from magshell_fenicsx.parts.gap import SOFT_PENETRATION, expanded_penalty, penalty
 from magshell_fenicsx.parts.penalty_contact import CROSSING_DISTANCE, PenaltyContact
 
 Array = NDArray[np.float64]
@@ -199,14 +197,10 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         if self._frozen:
             return self._moved_frozen_set(self._frozen)
         places, joined_places = self._places_in_contact()
-        penalties = self._penalty(self._h - joined_places.distance)
+        penalties = self.penalty.derivatives(self._h - joined_places.distance)
         if self.sample:
             penalties = self.sample.weigh(places.point[joined_places.first], penalties)
         return ActiveSet(self._points, places, joined_places, penalties)
-
-    def _penalty(self, penetration: Array) -> Penalty:
-        """Return psi of penetrations over R, with both derivatives."""
-        return penalty(penetration, self.stiffness.value, SOFT_PENETRATION * self._h)
 
     def _moved_frozen_set(self, frozen: FrozenContact[Places]) -> ActiveSet[Places]:
         """Return the active set of a frozen contact with its places moved to the present state.
@@ -220,12 +214,9 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             places = self._follow(frozen.places)
             change = places.distance - frozen.places.distance
             joined_places = joined_places.moved_by(change, BLUR_DISTANCE * self._h)
-        penalties = expanded_penalty(
-            self._h - joined_places.distance,
-            frozen.penetration,
-            self.stiffness.value,
-            SOFT_PENETRATION * self._h,
-            with_third_order=self.held is not None,
+        penetration = self._h - joined_places.distance
+        penalties = self.penalty.expanded(
+            penetration, frozen.penetration, with_third_order=self.held is not None
         )
         return ActiveSet(self._points, places, joined_places, penalties)
 
@@ -639,8 +630,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             point=active.places.point[active.joined_places.first],
             penetration=self._h - active.joined_places.distance,
             closing=active.closing_rates(self._gap_geometry(active.places), motion),
-            k=self.stiffness.value,
-            soft_penetration=SOFT_PENETRATION * self._h,
+            penalty=self.penalty,
         )
 
     # nodes and their images

@@ -461,7 +461,7 @@ class SurfaceContact(PairContact[Projections]):
         It is a measure to compare forces, in which each surface counts in full and not by half.
         """
         nearest = places.select(places.firsts)  # one place of each point and direction
-        _, pressures, _ = self._penalty(self._h - nearest.distance)
+        _, pressures, _ = self.penalty.derivatives(self._h - nearest.distance)
         return float(points.weight[nearest.point] @ pressures)
 
     def _near(self, u: Array) -> Projections:

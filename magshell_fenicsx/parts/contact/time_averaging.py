@@ -5,7 +5,7 @@ Contact sets in and ceases within a step, so that its force at one time of the s
 energy. The force of a point, and its derivative, are those of Simpson's rule along the way. Where
 that passes a kink of the penalty, factors give the point's force the work that its energy changes
 by, and its derivative that of this quotient: for one place in a straight motion these are the mean
-pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
+pressure of `Penalty.mean_pressure`. See docs/theory.md, Motion.
 
 A sample is a displacement on the way; positions on it go from 0 to 1. The penalty has kinks of its
 second derivative where contact begins, and at the soft penetration, up to which its stiffness
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.gap import PENETRATION_ROUNDING, penalty
+from magshell_fenicsx.parts.gap import PENETRATION_ROUNDING, Penalty
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.pair_contact import PairContact
@@ -99,8 +99,7 @@ class SampleRates:
         point: NDArray[np.int64],
         penetration: Array,
         closing: Array,
-        k: float,
-        soft_penetration: float,
+        penalty: Penalty,
     ) -> "SampleRates":
         """Return the penalties of places summed over each point's places.
 
@@ -111,14 +110,12 @@ class SampleRates:
         point, penetration, closing
             (n,) for each place: number of its point, penetration, and increase of the penetration
             along the whole way.
-        k, soft_penetration
-            Stiffness of the penalty, which grows from zero to k over the soft penetration.
         """
-        value, first, second = penalty(penetration, k, soft_penetration)
+        value, first, second = penalty.derivatives(penetration)
         # changes by rounding alone do not count, as they become divisors
-        closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft_penetration, closing, 0.0)
-        # 0 for an open place, 1 up to the soft penetration, 2 beyond; summed over a point's places
-        segment = np.digitize(penetration, (0.0, soft_penetration)).astype(float)
+        rounding = PENETRATION_ROUNDING * penalty.soft_penetration
+        closing = np.where(np.abs(closing) > rounding, closing, 0.0)
+        segment = penalty.segments(penetration).astype(float)  # summed over a point's places
         values_of_places = value, first * closing, second * closing**2, segment
         return cls(
             *(np.bincount(point, values, count).astype(float) for values in values_of_places)

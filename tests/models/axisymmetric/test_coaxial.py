@@ -13,7 +13,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import RevolvedGatherer
-from magshell_fenicsx.parts.gap import SOFT_PENETRATION, penalty
+from magshell_fenicsx.parts.gap import SOFT_PENETRATION, Penalty
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
@@ -348,7 +348,7 @@ def test_waves_of_contact(m: int, factor: str | None) -> None:
                 total += (
                     rule.weight[point]
                     / 2
-                    * penalty(np.array(deep), k, SOFT_PENETRATION * size)[0]
+                    * Penalty(k, SOFT_PENETRATION * size).derivatives(np.array(deep))[0]
                     / len(angles)
                 )
         return total
