@@ -68,7 +68,7 @@ def is_mirror_image(
 
 def is_axisymmetric(
     field: FieldFunction,
-    meridian: MeridianChart,
+    meridian: MeridianChart | None,
     *,
     in_space: bool = False,
     is_smooth: bool = False,
@@ -79,6 +79,8 @@ def is_axisymmetric(
 
     Parameters
     ----------
+    meridian
+        Meridian of the surface; None if it is no surface of revolution, which has no such field.
     in_space
         Whether this is asked beside the surface too, up to `MAX_OFFSET` from it.
     is_smooth

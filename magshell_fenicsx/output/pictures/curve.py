@@ -35,9 +35,9 @@ from magshell_fenicsx.output.pictures.lines import (
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.mode_labels import TORSION
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import shown_quantity
-from magshell_fenicsx.shells.modes import TORSION
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
