@@ -22,7 +22,7 @@ STEPS: dict[str, type[Step]] = {  # by their kinds
     for step_class in registered_classes("steps")
     for kind in get_args(step_class.model_fields["kind"].annotation)
 }
-FACTORS = [  # what grows to a factor
+FACTOR_STEPS = [  # what grows to a factor
     step_class for step_class in STEPS.values() if issubclass(step_class, FactorStep)
 ]
 FORMER_KINDS = (("fold", "crease"),)  # of steps in older case files, with the present ones
@@ -44,13 +44,13 @@ def step_class_of(name: str) -> type[Step]:
 
 def strengths_of(context: Context) -> dict[str, float]:
     """Return amplitude -> its value at a factor of one, of loads whose strength a section gives."""
-    strengths = {step_class.amplitude: step_class.strength(context) for step_class in FACTORS}
+    strengths = {step_class.amplitude: step_class.strength(context) for step_class in FACTOR_STEPS}
     return {name: strength for name, strength in strengths.items() if strength is not None}
 
 
 def section_of_strength(name: str) -> str:
     """Return the key of the section that gives the strength of a load, by its amplitude."""
-    return next(step_class.section for step_class in FACTORS if step_class.amplitude == name)
+    return next(step_class.section for step_class in FACTOR_STEPS if step_class.amplitude == name)
 
 
 def strength_ratios(old: Context, new: Context) -> dict[str, float]:

@@ -423,12 +423,12 @@ class Amplitude:
         Whether there may be several such parameters, whose columns have their names at the end.
     components
         Further amplitudes of the same load, across its first direction, which a step may turn.
-    turned
+    turned_load
         The load that it turns, of an angle, which itself is no parameter of the energy.
-    critical
+    critical_names
         Names of its value at the first instability as a number of a run: over its unit, and with
         units; empty without.
-    history
+    history_name
         Its name in the histories of a step in time, of a field; empty if that is its own name.
     """
 
@@ -439,11 +439,11 @@ class Amplitude:
     sideways: bool = False
     each: bool = False
     components: tuple[str, ...] = ()
-    turned: str = ""
-    critical: tuple[str, ...] = ()
-    history: str = ""
+    turned_load: str = ""
+    critical_names: tuple[str, ...] = ()
+    history_name: str = ""
 
     @property
     def is_field(self) -> bool:
         """Whether it is strength or direction of a field in space, which has no conjugate."""
-        return bool(self.components or self.turned)
+        return bool(self.components or self.turned_load)

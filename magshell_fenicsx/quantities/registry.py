@@ -227,7 +227,7 @@ AMPLITUDES = {
             "pressure",
             "p_over_pc",
             "volume_change",
-            critical=("knockdown", "buckling_pressure_Pa"),
+            critical_names=("knockdown", "buckling_pressure_Pa"),
         ),
         Amplitude("force", "force", "w_over_h", "at the load"),
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
@@ -235,10 +235,10 @@ AMPLITUDES = {
             "lambda_m",
             "lambda_m",
             components=("lambda_across", "lambda_third"),
-            critical=("critical_field", "critical_field_mT"),
-            history="field",
+            critical_names=("critical_field", "critical_field_mT"),
+            history_name="field",
         ),
-        Amplitude("angle", "field_angle", sideways=True, turned="lambda_m"),
+        Amplitude("angle", "field_angle", sideways=True, turned_load="lambda_m"),
         Amplitude("time", "time", sideways=True),
     )
 }

@@ -350,14 +350,14 @@ class Result:
     def _critical_loads(self, name: str) -> list[tuple[float, Row]]:
         """Return the loads at instabilities of the path itself, each with its row.
 
-        `name` is that of such a load as a number of a run, as `Amplitude.critical` has it.
+        `name` is that of such a load as a number of a run, as `Amplitude.critical_names` has it.
         """
         rows = [row for row in self.rows if row["label"] in LOCATED and not row["branch"]]
         loads = [amplitude(str(row["amplitude"])) for row in rows]
         return [
             (float(row[load.column]), row)
             for load, row in zip(loads, rows, strict=True)
-            if name in load.critical
+            if name in load.critical_names
         ]
 
     @property

@@ -211,7 +211,7 @@ def search_at_end_of_step(
         held_conjugates = held_conjugates_of_step(scene, step, begin)
         stage = make_stage(scene, end, held_conjugates)
         # a step that turns the field has an angle, which is no amplitude of the state
-        name = step.name if step.name in end.mu else amplitude(step.name).turned
+        name = step.name if step.name in end.mu else amplitude(step.name).turned_load
         for record in _solutions(stage, name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 

@@ -428,7 +428,7 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
 
 def amount_of(name: str, state: State) -> float:
     """Return the value of an amplitude at a state; of an angle, that of the load that it turns."""
-    return state.mu.get(name, state.mu.get(amplitude(name).turned, 0.0))
+    return state.mu.get(name, state.mu.get(amplitude(name).turned_load, 0.0))
 
 
 def _carried_over(

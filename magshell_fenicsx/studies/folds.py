@@ -317,5 +317,5 @@ def _apart_from_strength(case: Case) -> str:
     data = case.model_dump(mode="json") | case.outside
     if case.magnetic:
         data["magnetic"] = case.magnetic.apart_from_strength()
-    are_there = {name: bool(strength) for name, strength in case.context.strengths.items()}
-    return json.dumps([data, are_there], sort_keys=True)
+    is_nonzero = {name: bool(strength) for name, strength in case.context.strengths.items()}
+    return json.dumps([data, is_nonzero], sort_keys=True)

@@ -66,7 +66,7 @@ class Scalar:
             points = (
                 point["value"]
                 for point in summary["limit_points"]
-                if self.name in amplitude(point["amplitude"]).critical
+                if self.name in amplitude(point["amplitude"]).critical_names
             )
             return _number(next(points, None))
         if self.name in OF_SNAPS:

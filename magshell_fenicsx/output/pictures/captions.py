@@ -210,11 +210,11 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
         items.append(named_value("time", row))
     # other amplitudes, such as those of user-defined energies
     columns_of_amplitudes = (amplitude(name).column for name in amplitudes)
-    shown = (*field_columns(), *CAPTION_COLUMNS)
+    shown_columns = (*field_columns(), *CAPTION_COLUMNS)
     items += [
         named_value(column, row)
         for column in columns_of_amplitudes
-        if column not in shown and row.get(column)
+        if column not in shown_columns and row.get(column)
     ]
     return ", ".join(items)
 

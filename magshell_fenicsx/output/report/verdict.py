@@ -529,7 +529,7 @@ def _instability(
     displacement = _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
-    elif "critical_field" in amplitude(line["amplitude"]).critical:
+    elif "critical_field" in amplitude(line["amplitude"]).critical_names:
         sentence = "The field makes the shell unstable at the critical {}: a {}, {}."
     else:
         sentence = "The first instability on the path is at {}: a {}, {}."

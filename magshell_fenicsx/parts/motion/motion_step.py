@@ -173,7 +173,7 @@ class TimeSection(Step):
 
         key = context.step.key
         driven_before = context.driven_before(context.step.number)
-        turned_before = {amplitude(name).turned for name in driven_before}
+        turned_loads = {amplitude(name).turned_load for name in driven_before}
         for name, field in _amplitudes_of_histories().items():
             if name not in self.history:
                 continue
@@ -181,7 +181,7 @@ class TimeSection(Step):
             if not context.strengths.get(field.name):
                 section = section_of_strength(field.name)
                 raise ValueError(f"{key}.history.{name}: needs {section}.{field.name}, not zero")
-            if field.name in turned_before:
+            if field.name in turned_loads:
                 raise ValueError(f"{key}.history.{name}: not after kind: rotation")
         # times with units need a case that has units
         for time_key, text in self.with_units():
@@ -256,7 +256,7 @@ class TimeSection(Step):
 
 def _amplitudes_of_histories() -> dict[str, Amplitude]:
     """Return name in histories -> amplitude, of fields, whose amplitude has another name."""
-    return {a.history: a for a in AMPLITUDES.values() if a.history}
+    return {a.history_name: a for a in AMPLITUDES.values() if a.history_name}
 
 
 def _factors_of_sections(context: Context) -> set[str]:
@@ -264,9 +264,9 @@ def _factors_of_sections(context: Context) -> set[str]:
 
     They grow to a factor without a step of the programme.
     """
-    from magshell_fenicsx.parts.registered import FACTORS  # which has this step too
+    from magshell_fenicsx.parts.registered import FACTOR_STEPS  # which has this step too
 
-    return {step_class.amplitude for step_class in FACTORS if step_class.asked_for(context)}
+    return {step_class.amplitude for step_class in FACTOR_STEPS if step_class.asked_for(context)}
 
 
 def level_in(context: Context, name: str, level: Level) -> float:

@@ -593,11 +593,17 @@ def at_target(scene: Scene, record: Record) -> Ending:
     load = scene.problem.programme[record.step - 1].load
     target = load.end.target  # a pair: what it prescribes, and the value
     # a field that turns by an angle does its work through the component across
-    varied = amplitude(record.amplitude)
-    name = amplitude(varied.turned).components[0] if varied.turned else varied.name
+    varied_amplitude = amplitude(record.amplitude)
+    name = (
+        amplitude(varied_amplitude.turned_load).components[0]
+        if varied_amplitude.turned_load
+        else varied_amplitude.name
+    )
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held_value = (
-        -system.potential(state.u, state.mu, name) if by_conjugate and not varied.is_field else None
+        -system.potential(state.u, state.mu, name)
+        if by_conjugate and not varied_amplitude.is_field
+        else None
     )
     kind: Literal["target", "held"] = (
         "held" if any(law != "load" for law in load.hold.values()) else "target"

@@ -22,10 +22,10 @@ from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import leaves_path
 
-_LOADS = [a for a in quantities.AMPLITUDES.values() if a.critical]
+_LOADS = [a for a in quantities.AMPLITUDES.values() if a.critical_names]
 # result -> the amplitude of its fold; and of those in units -> key of the unit
-FOLDS = {name: load.name for load in _LOADS for name in load.critical}
-SCALES = {load.critical[1]: quantities.quantity(load.column).scale for load in _LOADS}
+FOLDS = {name: load.name for load in _LOADS for name in load.critical_names}
+SCALES = {load.critical_names[1]: quantities.quantity(load.column).scale for load in _LOADS}
 MAX_LOAD_RATIO = 1.15  # instabilities up to this multiple of the lowest are looked at
 MAX_INSTABILITIES = 5  # and at most so many
 
