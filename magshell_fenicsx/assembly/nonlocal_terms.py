@@ -20,7 +20,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, kron
 
 from magshell_fenicsx.assembly.dense_tangent import DenseTangent, DenseTerm
 from magshell_fenicsx.assembly.terms import Term
@@ -226,20 +226,18 @@ class NonlocalEntries:
         Terms whose factor in `factors` is zero do not count.
         """
         pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
-        row_nodes, column_nodes = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
-        node_count = len(self._fixed) // self._block_size
-        # each pair of nodes once, as the number row * node_count + column
-        pair_numbers = np.unique(row_nodes * node_count + column_nodes)
-        row_nodes, column_nodes = np.divmod(pair_numbers, node_count)
-        # the unknowns of the row node (i) and of the column node (j) of each pair, (pairs, 1, 3)
-        i, j = (
-            self._block_size * nodes[:, None, None] + np.arange(self._block_size)
-            for nodes in (row_nodes, column_nodes)
-        )
-        # all components of the first node with all of the second, (pairs, 3, 3)
-        i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
-        entries = i.ravel(), j.ravel(), np.ones(i.size, dtype=np.int8)
-        return _pattern_of(_owned_rows(self._comm, self._ranges, self._fixed, entries))
+        rows, columns = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
+        # the pattern (own nodes, all nodes), where several terms may have the same pair
+        size = self._block_size
+        flags, no_node = np.ones(len(rows), np.bool_), np.zeros(len(self._fixed) // size, np.bool_)
+        nodes = _owned_rows(self._comm, self._ranges // size, no_node, (rows, columns, flags))
+        # all components of the first node with all of the second, but for clamped unknowns
+        pattern = kron(nodes, np.ones((size, size), np.bool_), format="bsr").tocsr()
+        clamped_rows = np.repeat(self._fixed[self._own], np.diff(pattern.indptr))
+        pattern.data = ~(clamped_rows | self._fixed[pattern.indices])
+        pattern.eliminate_zeros()
+        pattern.sort_indices()
+        return _pattern_of(pattern)
 
 
 class _MatrixSum:
@@ -414,14 +412,20 @@ def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
 
 
 def pairs_of(nodes: Longs) -> tuple[Longs, Longs]:
-    """Return all ordered pairs of the k nodes in each row of an array (n, k).
+    """Return all ordered pairs of nodes that share a row of an array (n, k), each pair once.
+
+    Cells in contact share many nodes: there are far fewer such pairs than n k^2. A product of
+    sparse flags finds them without a list of all.
 
     Returns
     -------
-    The first and the second node of each pair, both (n k^2,).
+    The first and the second node of each pair, both (pairs,).
     """
-    i, j = np.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
-    return i.ravel(), j.ravel()
+    rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    flags, shape = np.ones(nodes.size, dtype=np.bool_), (len(nodes), nodes.max(initial=-1) + 1)
+    has_node = coo_array((flags, (rows, nodes.ravel())), shape).tocsr()
+    i, j = (has_node.T @ has_node).nonzero()
+    return i.astype(np.int64), j.astype(np.int64)
 
 
 def _pattern_of(matrix: csr_array) -> csr_array:

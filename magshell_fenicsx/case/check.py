@@ -18,6 +18,7 @@ from magshell_fenicsx.parts.magnetism.fields import GROUPS, dimensionless_groups
 from magshell_fenicsx.parts.magnetism.interaction import refuse_large
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
+from magshell_fenicsx.parts.supports.supports import NOT_HELD
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.problem.formulas import case_formulas, cells_of_patch, unresolved_formulas
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
@@ -91,18 +92,22 @@ def _description(case: Case, problem: Problem) -> str:
 
 def _refuse_unsupported(problem: Problem) -> None:
     """Raise CaseError for a shell that nothing holds."""
-    unsupported = all(
-        condition in ("free", "symmetry") for condition in problem.conditions.values()
-    )
+    conditions = [*problem.conditions.values()]
+    unsupported = all(condition in ("free", "symmetry", "plane") for condition in conditions)
+    # each plane of symmetry stops the motion along its normal: those of a meridian have one normal
+    normals = min(conditions.count("plane"), 1 if problem.axisymmetric else 3)
     # springs may be among user-defined energies: a run finds out from its tangent matrix
     springs_may_hold = bool(problem.loads.user_terms)
-    if not unsupported or problem.at_rest:
+    if not unsupported or normals == 3 or problem.at_rest:
         return
-    if not (problem.moves_freely or springs_may_hold):
-        raise CaseError(
-            "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
-            + problem.support_hint
-        )
+    if problem.moves_freely or springs_may_hold:
+        return
+    if normals:
+        raise CaseError(NOT_HELD + "move in its planes of symmetry" + problem.support_hint)
+    raise CaseError(
+        "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
+        + problem.support_hint
+    )
 
 
 def _number_lines(case: Case, problem: Problem) -> list[str]:

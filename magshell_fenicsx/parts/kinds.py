@@ -93,13 +93,16 @@ class LawChoice(Section):
         law's energy.
         """
         values = self._values_of(section)
+        missing = [key for key, value in values.items() if value is None]
+        if is_chosen and missing:
+            raise ValueError(f"law: {self.law} needs {' and '.join(missing)}")
         lengths = [
             len(value or [])
             for key, value in values.items()
             if get_origin(section.model_fields[key].annotation) is list
         ]
-        is_given = {value is not None for value in values.values()}
-        if is_given <= {is_chosen} and len({*lengths}) <= 1:
+        is_misplaced = not is_chosen and len(missing) < len(values)
+        if not is_misplaced and len({*lengths}) <= 1:
             return
         counts = f", with {' and '.join(map(str, lengths))} numbers" if lengths else ""
         raise ValueError(

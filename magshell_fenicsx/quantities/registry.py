@@ -285,9 +285,18 @@ def endings() -> dict[str, str]:
 def quantity(name: str) -> Quantity:
     """Return the quantity of a column of path.csv, also of one that is not registered.
 
+    A name that tells no quantity is the factor of a motion or of a user's energy, which is a load.
+    """
+    factor = Quantity(name, name.replace("_", " "), "", "load", units=(DISTANCE, TURN))
+    return told_quantity(name) or factor
+
+
+def told_quantity(name: str) -> Quantity | None:
+    """Return the quantity that the name of a dimensionless column tells; None if it tells none.
+
     Not registered are the columns of a second load ("force_2"), of its displacement
-    ("w_force_2_over_h"), of one of several bodies, of the displacement or reaction of a named place
-    ("rim_ux"), and of a user-defined amplitude, which has its own name.
+    ("w_force_2_over_h"), of one of several bodies, and of the displacement, reaction or moment of a
+    named place ("rim_ux"). The factor of a motion or of a user's energy has any name.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
@@ -318,19 +327,40 @@ def quantity(name: str) -> Quantity:
     if families:
         longest = max(families, key=lambda q: len(q.name))
         return longest.for_name(name.removeprefix(f"{longest.name}_"))
-    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis;
-    # all else is the factor of a motion or of a user's energy, which is a load
+    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis
     kinds_and_units: dict[str, tuple[Kind, Unit]] = {
         "u": ("place", PLACE),
         "f": ("reaction", REACTION),
         "m": ("moment", MOMENT),
     }
-    kind: Kind = "load"
-    units: tuple[Unit, ...] = (DISTANCE, TURN)
     if ending := re.search(r"_([ufm])[xyz]$", name):
         kind, unit = kinds_and_units[ending[1]]
-        units = (unit,)
-    return Quantity(name, name.replace("_", " "), "", kind, units=units)
+        return Quantity(name, name.replace("_", " "), "", kind, units=(unit,))
+    return None
+
+
+def is_column_of_numbers(name: str) -> bool:
+    """Return whether a name tells a column of numbers in path.csv, in a unit or without.
+
+    Examples
+    --------
+    >>> [is_column_of_numbers(name) for name in ("rim_mx", "rim_mx_N_m", "rim", "label")]
+    [True, True, False, False]
+    """
+    if found := told_quantity(name):
+        return found.kind != "text"
+    if any(name == column.name for q in QUANTITIES.values() for column in q.in_units):
+        return True
+    # one that is not registered, in a unit: its name lost an "over_h" and has the unit's ending
+    for ending in endings():
+        words = name.removesuffix(f"_{ending}").split("_")
+        places = range(1, len(words) + 1)
+        over_h = ("_".join([*words[:i], "over_h", *words[i:]]) for i in places)
+        for dimensionless in ("_".join(words), *over_h):
+            found = told_quantity(dimensionless)
+            if found and any(name == column.name for column in found.in_units):
+                return True
+    return False
 
 
 def shown_quantity(name: str, columns: Collection[str]) -> Quantity:

@@ -17,13 +17,8 @@ from scipy.interpolate import barycentric_interpolate
 
 import magshell_fenicsx.parts.registered  # noqa: F401  the columns of parts are in the registry
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
-from magshell_fenicsx.quantities.registry import OWN_MODES, QUANTITIES, amplitude, quantity
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, is_column_of_numbers
 
-# columns of single things: a named point or support, a second load, and the displacement at a load
-SINGLE_COLUMNS = re.compile(
-    r"\w+_[ufm][xyz](_[A-Za-z]+)?|(force|load)_\d+|w_(force|load)(_\d+)?_over_h"
-)
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
 FORMS = (
@@ -111,7 +106,7 @@ def parse_scalar(text: str) -> Scalar:
         )
     # both names must be columns with numbers; "end" has no second one
     for name in (column, place_column) if place != "end" else (column,):
-        if not _may_have_numbers(name):
+        if not is_column_of_numbers(name):
             raise CaseError(
                 f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}"
             )
@@ -124,21 +119,6 @@ def parse_scalar(text: str) -> Scalar:
     if not math.isfinite(value):
         raise CaseError(f"--result {text}: {number or 'nothing'} is no finite number; {FORMS}")
     return Scalar(text, column, place_column, value)
-
-
-def _may_have_numbers(column: str) -> bool:
-    """Return whether a path.csv may have a column with numbers of this name, in a unit or without.
-
-    It is a column of every run, of a part, or of one thing of several, such as a body.
-    """
-    if column in TEXTS:
-        return False
-    if SINGLE_COLUMNS.fullmatch(column):
-        return True
-    registered = [quantity(name) for name in (*COLUMNS, *QUANTITIES) if name not in TEXTS]
-    names = {name for q in registered for name in (q.name, *(unit.name for unit in q.in_units))}
-    is_of_family = any(q.each and column.startswith(f"{q.name}_") for q in registered)
-    return column in names or is_of_family
 
 
 def _crossing(

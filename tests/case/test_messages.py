@@ -95,6 +95,10 @@ MISTAKES = [
             "as target; control: arc"
         ),
     ),
+    # a missing key of a law is not a misplaced one
+    ("shell.law=mooney-rivlin", "cap.yaml:1: shell: law: mooney-rivlin needs mooney"),
+    ("shell.law=ogden", "cap.yaml:1: shell: law: ogden needs mu and alpha"),
+    ("shell.mooney=0.1", "C01/C10 belongs to law: mooney-rivlin, and only to it"),
 ]
 
 

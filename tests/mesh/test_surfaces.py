@@ -294,6 +294,22 @@ def test_a_check_sees_that_nothing_is_held(boundary: dict[str, str]) -> None:
         describe(Case.from_source(Source("test", {"shell": shell, "boundary": boundary})))
 
 
+@pytest.mark.parametrize("symmetry", ["auto", "none"])
+@pytest.mark.parametrize(
+    "shell",
+    [
+        {"geometry": "cylinder", "radius": 1, "length": 2, **COMMON},
+        {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+    ],
+)
+def test_planes_of_symmetry_hold_no_shell_alone(shell: dict[str, Any], symmetry: str) -> None:
+    """It moves across its axis: `check` refuses on meridian and surface what a run refuses."""
+    edge = "equator" if shell["geometry"] == "hemisphere" else "bottom"
+    data = {"shell": shell, "boundary": {edge: "symmetry"}, "symmetry": symmetry}
+    with pytest.raises(CaseError, match="not held: it is free to move in its planes of symmetry"):
+        describe(Case.from_source(Source("test", data)))
+
+
 def test_units_are_turned_into_si() -> None:
     shell = {
         "geometry": "cylinder",

@@ -47,6 +47,10 @@ def test_a_natural_shape_that_is_none(natural):
         ),
         ({"gradients": {"by": ["nope"]}}, r"gradients\.by: nope: the case has no such key"),
         (
+            {"gradients": {"by": ["lambda_m"]}},
+            r"gradients\.by: lambda_m: nothing in the case has this amplitude; it has pressure",
+        ),
+        (
             {
                 "design": {
                     "numbers": {"shell.poisson_ratio": [0.2, 0.4]},

@@ -104,7 +104,20 @@ def test_results_of_the_summary() -> None:
 
 
 @pytest.mark.parametrize(
-    "column", ["w_mm", "gravity_m_per_s2", "force_ball", "force_2", "A_uz_mm", "rim_fz", "time"]
+    "column",
+    [
+        "w_mm",
+        "gravity_m_per_s2",
+        "force_ball",
+        "force_ball_N",
+        "force_2",
+        "approach_ball_mm",
+        "w_force_2_mm",
+        "A_uz_mm",
+        "rim_fz",
+        "rim_mx_N_m",
+        "time",
+    ],
 )
 def test_columns_of_all_parts_are_results(column: str) -> None:
     assert parse_scalar(f"{column}@end") == Scalar(f"{column}@end", column, "end")
@@ -123,6 +136,7 @@ def test_columns_of_all_parts_are_results(column: str) -> None:
         ("force", "nothing is no column"),
         ("force@w=1", "w is no column"),
         ("label@end", "label is no column"),
+        ("A_uz_parsec@end", "A_uz_parsec is no column"),
         ("force@w_over_h=", "nothing is no finite number"),
         ("force@w_over_h=nan", "nan is no finite number"),
         ("force@w_over_h=ten", "ten is no finite number"),

@@ -26,6 +26,7 @@ from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.loads import forces
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.registry import AMPLITUDES
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.contact_control import stiffened_equilibrium
 from magshell_fenicsx.simulate.gradients.adjoint import (
@@ -217,8 +218,13 @@ def refuse_unknown_parameters(context: Context, names: Iterable[str], start: Sta
     """
     try:
         for name in names:
-            if name not in FIELDS and name not in start.mu:
-                number_at_key(context, name)
+            if name in FIELDS or name in start.mu:
+                continue
+            if name in AMPLITUDES:
+                raise CaseError(
+                    f"{name}: nothing in the case has this amplitude; it has {', '.join(start.mu)}"
+                )
+            number_at_key(context, name)
     except CaseError as e:
         raise CaseError(f"gradients.by: {e}") from None
 
