@@ -19,6 +19,7 @@ make extremes         shells far from the ordinary ones into docs/extremes/: 5 m
 make noise            every case under relative noise into docs/noise/: an hour on one core (ARGS="--seeds 3")
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
+make effectivity      estimated errors over true ones, as a table: 10 minutes
 make studies          error against run time of two cases into docs/study/: 10 minutes
 make test             lint and the tests that are not marked slow: 10 minutes on two cores
                       (TESTS="tests/simulate ...": of these folders; MARK=slow, MARK=telling: those so marked;
@@ -33,7 +34,7 @@ make clean            remove caches and compiled kernels; keeps .env/root*, .env
 endef
 export HELP
 
-.PHONY: help run check figures benchmarks extremes noise bench studies gallery site test test-all lint image clean
+.PHONY: help run check figures benchmarks extremes noise bench effectivity studies gallery site test test-all lint image clean
 
 help:
 	@echo "$$HELP"
@@ -54,6 +55,9 @@ extremes:
 noise:
 	@mkdir -p docs/noise
 	$(ENV) $(CAMPAIGN) noise.table $(ARGS) > results/noise.md && mv results/noise.md docs/noise/README.md
+
+effectivity:
+	$(ENV) $(CAMPAIGN) effectivity $(ARGS)
 
 bench:
 	$(ENV) $(CAMPAIGN) speed $(if $(OUT),--out $(OUT)) --compare docs/bench/bench.json $(ARGS)

@@ -416,6 +416,40 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
     )
 
 
+def fold_by_one_step(
+    newton: BorderedNewton, state: State, phi: Vector, name: str
+) -> tuple[State, Vector]:
+    """Return the fold near a good guess, and its null vector, by one factorisation. Collective.
+
+    After one step of Newton's method the amplitude is corrected, so that v . R = 0 with the null
+    vector v there. What the step has left of the error of u changes it in second order alone.
+
+    Parameters
+    ----------
+    state, phi
+        The guess, and a vector near its null vector.
+
+    Raises
+    ------
+    FoldLost
+        If the step is too long, or the tangent is singular in two directions.
+    """
+    system = newton.system
+    try:
+        tangent = AugmentedTangent(newton, state, phi)
+        du, dmu = _newton_step(system, state, name, tangent)
+    except np.linalg.LinAlgError:
+        raise FoldLost("the tangent is singular in more than one direction") from None
+    if not max_abs(system.comm, du) <= MAX_STEP * system.length:
+        raise FoldLost("Newton's method diverged on its way to a fold")
+    found = state.with_(state.u + du, name, state.mu[name] + dmu)
+    v = tangent.null_vector_at(state, found)
+    load = system.load(found.u, found.mu, name)
+    residual_along_v = dot(system.comm, v, system.residual(found.u, found.mu))
+    correction = -residual_along_v / dot(system.comm, v, load)
+    return found.with_(found.u, name, found.mu[name] + correction), v
+
+
 def residual_multiplier(system: System, fold: Fold) -> Vector:
     """Return w = -l/(l . R_mu) with the left null vector l of a fold; collective.
 

@@ -408,10 +408,41 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         except ModesNotFound as e:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
+        if folder and number == result.end:
+            add_frequency_errors(result, scene, modes, time_unit)
         wave = symmetric_wave(whole_shell.model)
         say(_lowest_frequency(number, scene, modes, wave, time_unit))
     if folder is not None:
         _write_frequencies(result, folder, states, whole_shells, section.count)
+
+
+def add_frequency_errors(
+    result: Result, scene: Scene, modes: Sequence[ShellMode], time_unit: float | None
+) -> None:
+    """Add the estimated errors of the frequencies at the last point to those of a run; collective.
+
+    Parameters
+    ----------
+    scene
+        Scene of the last point.
+    modes
+        Natural modes there.
+    time_unit
+        Unit of time (s), for hertz; None without.
+    """
+    from magshell_fenicsx.simulate.discretisation_error import frequency_errors
+
+    if result.last_record is None or result.stopped:
+        return
+    estimates, errors = result.error_estimates, dict[str, float]()
+    with estimates.naming("frequencies"):
+        errors = frequency_errors(scene, result.last_record, modes)
+    estimates.errors |= errors
+    for number, mode in enumerate(modes, 1):
+        frequency = hertz(mode.eigenvalue, time_unit)
+        if frequency and (error := errors.get(f"omega2_{number}")) is not None:
+            # the frequency is in proportion to the root of omega2
+            estimates.errors[f"hertz_{number}"] = frequency * error / (2 * abs(mode.eigenvalue))
 
 
 def _write_frequencies(

@@ -17,7 +17,8 @@ Words and symbols:
   symmetry excludes families of modes.
 """
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,10 +35,9 @@ from magshell_fenicsx.continuation.control import (
 )
 from magshell_fenicsx.continuation.fold import (
     AugmentedTangent,
-    FoldGuess,
     FoldLost,
-    find_fold,
     first_difference,
+    fold_by_one_step,
     held_along,
     third_derivative,
 )
@@ -53,6 +53,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.shells.waves import WaveFamily
 from magshell_fenicsx.simulate.adapt.ending import History, at_target
 from magshell_fenicsx.simulate.adapt.tolerance import SAFETY
@@ -67,6 +68,7 @@ from magshell_fenicsx.simulate.steps import stage_of_step
 
 SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue along the path
 ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
+FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
 FAILURES = (
     CaseError,
@@ -76,6 +78,7 @@ FAILURES = (
     NoEigenpair,
     ModesNotFound,
     np.linalg.LinAlgError,
+    ValueError,
     PETSc.Error,
 )
 
@@ -93,7 +96,7 @@ class ErrorEstimates:
     errors
         Name of a result -> its estimated absolute error. Names are "knockdown" and
         "critical_field", "limit_load" (the first value of `limit_points`), and COLUMN@end, a column
-        of path.csv at the last point.
+        of path.csv at the last point. Also "barrier", and "omega2_1" and so on at the last point.
     reasons
         Name of a result, "end" for all at the last point -> why it has no estimate.
     """
@@ -146,6 +149,43 @@ def estimate_errors(scene: Scene, history: History) -> ErrorEstimates:
             change = last.barrier_from(begin)
             estimates.errors["barrier"] = _estimated(change)
     return estimates
+
+
+def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -> dict[str, float]:
+    """Return name -> estimated error of the natural modes at a record, "omega2_1", ...; collective.
+
+    A mode is compared with the mode of the same label and rank.
+
+    Parameters
+    ----------
+    scene
+        Scene of the record.
+    modes
+        Natural modes there, in ascending order.
+
+    Raises
+    ------
+    NotEstimated, or one of `FAILURES`
+        If the state or the modes are not found with one degree more.
+    """
+    _refuse(scene, record)
+    if scene.model.contacts or scene.model.shell_contacts:
+        raise NotEstimated("frequencies depend on the stiffness of contacts")
+    comparison = Comparison(scene, fine_scene(scene), record)
+    space = mode_space(comparison.fine.model)
+    fine_modes = ShellModes(space.model).vibrations(
+        space.state(comparison.state),
+        len(modes) + FURTHER_MODES,
+        allows_rigid_motion=scene.allows_rigid_motion,
+    )
+    errors, ranks = dict[str, float](), Counter[str]()
+    for number, mode in enumerate(modes, 1):
+        of_label = [each.eigenvalue for each in fine_modes if each.label == mode.label]
+        if mode.eigenvalue and ranks[mode.label] < len(of_label):  # a rigid motion is exact
+            change = of_label[ranks[mode.label]] - mode.eigenvalue
+            errors[f"omega2_{number}"] = _estimated(change)
+        ranks[mode.label] += 1
+    return errors
 
 
 def _estimated(change: float, load_error: float = 0.0) -> float:
@@ -351,9 +391,9 @@ class Comparison:
         stage, guess = self._stage()
         du = with_higher_degree(self.scene, self.fine, self.record.point.du)
         phi = stage.padded(du)
-        fold = find_fold(stage.newton, FoldGuess(guess, phi), self.record.amplitude)
-        _refuse_other_mode(stage, phi, fold.phi)
-        return stage.leave(fold.state)
+        state, fine_phi = fold_by_one_step(stage.newton, guess, phi, self.record.amplitude)
+        _refuse_other_mode(stage, phi, fine_phi)
+        return stage.leave(state)
 
     def _own_bifurcation(self) -> State:
         """Return the state where a mode of the model itself is neutral, near the record.

@@ -50,6 +50,8 @@ class Outcome:
         Numbers of a case with units, as in summary.json.
     snaps
         As in summary.json.
+    errors
+        Name of a result -> its estimated absolute error, as in summary.json; empty if nobody asked.
     """
 
     knockdown: float | None
@@ -64,6 +66,7 @@ class Outcome:
     cpu_s: float = 0.0
     in_units: dict[str, float] = field(default_factory=dict)
     snaps: list[dict[str, Any]] = field(default_factory=list)
+    errors: dict[str, float] = field(default_factory=dict)
 
     @classmethod
     def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
@@ -123,6 +126,7 @@ def outcome_of(
     factorisations: int | None = None,
     wall_s: float = 0.0,
     columns: Sequence[str] = COLUMNS,
+    errors: Mapping[str, float] | None = None,
 ) -> Outcome:
     """Return the outcome of a run, or of a fold in the form of a run.
 
@@ -134,6 +138,8 @@ def outcome_of(
         Number of factorisations; None for those of the result's own scene.
     columns
         Columns of path.csv that the curve keeps, beside those that the scene adds.
+    errors
+        `Result.errors`, where they are wanted.
     """
     if factorisations is None:
         factorisations = result.scene.newton.factorisation.count
@@ -156,6 +162,7 @@ def outcome_of(
         barrier=result.barrier,
         in_units=in_units(result),
         snaps=snaps(result.rows) if origin == "path" else [],  # a fold alone has no path
+        errors=dict(errors or {}),
     )
 
 

@@ -12,6 +12,7 @@ from magshell_fenicsx.continuation.fold import (
     FoldLost,
     find_fold,
     fold_ahead,
+    fold_by_one_step,
     predict_fold,
     residual_multiplier,
 )
@@ -55,6 +56,17 @@ def test_a_found_fold_is_found_again(toy: Toy) -> None:
     assert again.value == pytest.approx(first.value, rel=1e-14)
     assert again.state.u == pytest.approx(first.state.u, abs=1e-10)
     assert again.iterations == 1
+
+
+def test_one_step_from_a_good_guess() -> None:
+    """load'' = 6 (x - 1) = -3.46: from 0.02 beside the fold a step of Newton's method leaves 3.5e-4
+    of x, and the load there is off by 1.73 times the square of that.
+    """
+    newton, guess = BorderedNewton(snap_through()), State(np.array([FOLD + 0.02]), {"load": 0.38})
+    state, _ = fold_by_one_step(newton, guess, np.array([0.5]), "load")
+    assert state.u[0] == pytest.approx(FOLD, abs=5e-4)
+    assert state.mu["load"] == pytest.approx(FOLD**3 - 3 * FOLD**2 + 2 * FOLD, abs=4e-7)
+    assert newton.factorisation.count == 1
 
 
 def test_other_unstable_directions_are_counted() -> None:

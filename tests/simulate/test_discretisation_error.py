@@ -73,6 +73,16 @@ def test_critical_field_and_displacement_beyond_it() -> None:
     assert in_units == pytest.approx(field, rel=1e-3)
 
 
+def test_frequencies(tmp_path: Path) -> None:
+    """The sixth of the modes that are no rigid motions; these have no error."""
+    result = run(Case.load(CASES / "free_plate.yaml", COARSE), tmp_path / "out", pictures=False)
+    modes = result.frequencies[0]
+    check_effectivity(result, "omega2_7", modes[6].eigenvalue, 0.00166110321)
+    assert "omega2_6" not in result.errors
+    relative_error = result.errors["omega2_7"] / modes[6].eigenvalue
+    assert result.errors["hertz_7"] / 165.448 == pytest.approx(relative_error / 2, rel=1e-4)
+
+
 def test_what_has_no_estimate_says_why() -> None:
     settings = ["mesh.refinement=0.3", "shell.radius_to_thickness=20", "loading.points=1"]
     result = run(

@@ -13,8 +13,11 @@ from functools import partial
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.fold import FoldLost
+from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.runs.running import Result, run
+from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.folds import Continuation, fold_row, has_knockdown, scene_of
 from magshell_fenicsx.studies.outcome import Outcome, outcome_of
@@ -216,9 +219,13 @@ def _by_fold(
         fold = continuation.follow(link.at, scene)
     except FoldLost:
         return None, factorisation.count - count_before
-    result = Result(scene, fold.state, [fold_row(scene, fold)])
     work = factorisation.count - count_before
-    return outcome_of(result, "fold", work, time.perf_counter() - start, folds.columns), work
+    point = Point(fold.state, fold.value, fold.phi, 0.0, fold.unstable, fold.unstable)
+    record = Record("fold", fold.name, point, step=len(scene.problem.programme))
+    history, row = History(located=[record]), fold_row(scene, fold)
+    result = Result(scene, fold.state, [row], path_history=history)
+    errors, wall_s = result.errors, time.perf_counter() - start
+    return outcome_of(result, "fold", work, wall_s, folds.columns, errors), work
 
 
 def _by_path(
@@ -248,7 +255,8 @@ def _by_path(
         return Outcome.failed(str(e), time.perf_counter() - start, factorisations), None
     continuation = _continuation_from(link.at, result) if go_on else None
     work = factorisations + result.scene.newton.factorisation.count
-    return outcome_of(result, "path", work, time.perf_counter() - start, columns), continuation
+    errors, wall_s = result.errors, time.perf_counter() - start
+    return outcome_of(result, "path", work, wall_s, columns, errors), continuation
 
 
 def _continuation_from(parameter: float, result: Result) -> Continuation | None:

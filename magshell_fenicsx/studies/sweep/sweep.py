@@ -24,6 +24,7 @@ from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import COLUMNS, write_csv
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.quantities.quantity import number_with_error
 from magshell_fenicsx.quantities.registry import endings, field_columns
 from magshell_fenicsx.studies.outcome import Outcome
 from magshell_fenicsx.studies.points import (
@@ -259,12 +260,15 @@ def _words(outcome: Outcome, scalar: Scalar | None) -> str:
     """
     result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
-        value = outcome.value(scalar)
-        result_text = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g}"
+        value, error = outcome.value(scalar), outcome.errors.get(scalar.name)
+        result_text = f"no {scalar.name}"
+        if value is not None:
+            result_text = f"{scalar.name} = {number_with_error(value, error)}"
     elif outcome.knockdown is not None:
         pascals = outcome.in_units.get("buckling_pressure_Pa")
         in_pascals = f", {pascals:.6g} Pa" if pascals else ""
-        result_text = f"k_d = {outcome.knockdown:.6f}{in_pascals} ({outcome.found})"
+        k_d = number_with_error(outcome.knockdown, outcome.errors.get("knockdown"), 6)
+        result_text = f"k_d = {k_d}{in_pascals} ({outcome.found})"
     elif outcome.barrier is not None:
         result_text = f"barrier = {outcome.barrier:.6g} E h R^2"
     elif outcome.limit:
@@ -430,7 +434,7 @@ def _write(
     points = [point for point, _ in outcomes_of_points]
     outcomes = [outcome for _, outcome in outcomes_of_points]
     results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
-    _write_points(axes, outcomes_of_points, results, folder / TABLE)
+    _write_points(axes, outcomes_of_points, scalar, results, folder / TABLE)
     _write_curves(outcomes_of_points, folder / CURVES)
     draw_sweep(
         axes,
@@ -444,6 +448,7 @@ def _write(
 def _write_points(
     axes: Sequence[Axis],
     outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]],
+    scalar: Scalar | None,
     results: Sequence[float | None] | None,
     file: Path,
 ) -> None:
@@ -455,8 +460,8 @@ def _write_points(
     ----------
     outcomes_of_points
         Each point with its outcome.
-    results
-        The requested number at each point; None if none was requested.
+    scalar, results
+        The requested number, and its value at each point; None if none was requested.
     """
     rows = [
         {**point_columns(axes, point), **sweep_row(outcome), **_in_units(outcome)}
@@ -464,7 +469,11 @@ def _write_points(
     ]
     # with the requested number, if there is one
     if results:
-        rows = [row | {"result": value} for row, value in zip(rows, results, strict=True)]
+        name = scalar.name if scalar else ""
+        rows = [
+            row | {"result": value, "result_error": outcome.errors.get(name)}
+            for row, value, (_, outcome) in zip(rows, results, outcomes_of_points, strict=True)
+        ]
     first_point, _ = outcomes_of_points[0]
     write_table(rows, file, first=(*first_point.values, *FIRST_COLUMNS))
 
@@ -498,4 +507,8 @@ def sweep_row(outcome: Outcome) -> Mapping[str, Any]:
         "k_d": outcome.knockdown,
         **{key: limit.get(key) for key in OF_LIMIT},
         **{name: getattr(outcome, name) for name in names},
+        **{
+            column: outcome.errors.get(name)
+            for name, column in (("knockdown", "k_d_error"), ("barrier", "barrier_error"))
+        },
     }
