@@ -37,6 +37,7 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 from magshell_fenicsx.parts.penalty_contact import PenaltyOptions
@@ -412,6 +413,44 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
         messages = model.system.comm.allgather(field.passed_through(*ends))
         if message := next((message for message in messages if message), ""):
             raise PathStopped(message, low, final=True)
+
+
+def refuse_pressed_support(stage: Stage, low: Point, high: Point) -> None:
+    """Check that no body has come through a held place of a shell between two points; collective.
+
+    Nothing gives way there: no stiffness of the penalty would make the penetration smaller. Only
+    nodes whose displacement is prescribed count, of shells with an even thickness that stays.
+
+    Raises
+    ------
+    PathStopped
+        If a body penetrates more than its bound there; the path must end.
+    """
+    scene, state = stage.scene, stage.leave(high.state)
+    problem, model = scene.problem, scene.model
+    is_even = problem.thickness is None and not problem.material.law.thins_somewhere
+    bodies = [body for body in problem.loads.contacts if not body.has_given_stiffness]
+    if problem.body or not is_even or not bodies:
+        return
+    h, nodes = problem.material.h, _prescribed_nodes(scene)
+    if not len(nodes):
+        return
+    r0 = model.r0.x.array[: model.system.size]
+    own_places = r0 + model.system.with_ghosts(state.u, state.mu)[: model.system.size]
+    places = np.concatenate(model.system.comm.allgather(own_places))
+    if model.axisymmetric:  # (rho, z) in the plane of e1 and e3
+        places = np.insert(places.reshape(-1, 2), 1, 0.0, axis=1)
+    held_places = places.reshape(-1, 3)[nodes]
+    for body in bodies:
+        gaps, _, _ = body.gap(held_places, state.mu[body.amplitude] * h, h / 2)
+        if gaps.min() < -body.max_penetration * h:
+            place = place_text(held_places[gaps.argmin()].round(9) + 0.0)  # + 0.0 makes -0 a 0
+            raise PathStopped(
+                f"the body {body.body} presses on a held place, {place}, over R, where nothing "
+                "gives way: end its approach before, move it, or leave that place free",
+                low,
+                final=True,
+            )
 
 
 def before_passing(stage: Stage, low: State, high: State) -> State:

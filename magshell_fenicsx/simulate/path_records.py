@@ -51,6 +51,7 @@ from magshell_fenicsx.simulate.contact_control import (
     recall_cuts,
     refuse_crossing,
     refuse_passing,
+    refuse_pressed_support,
     refuse_return,
     with_own_contact,
 )
@@ -246,6 +247,7 @@ class _Checks:
         try:
             refuse_crossing(stage, low, high)
             refuse_passing(stage, low, high)
+            refuse_pressed_support(stage, low, high)
             if self._returns:
                 refuse_return(stage, self._path.name, self.walk.points, high)
         except StepTooLong as e:

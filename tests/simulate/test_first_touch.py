@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magshell_fenicsx import Case, Scene
+from magshell_fenicsx import Case, Scene, Stopped
 from magshell_fenicsx.simulate.follow import follow
 
 h, LOAD = 0.02, 4e-5
@@ -105,3 +105,30 @@ def test_a_plate_flattens_half_a_ring() -> None:
     assert len(forces) == 4
     assert np.all(np.diff(forces) > 0)
     assert len(passed) < 30, "it does not creep"
+
+
+HOLE: dict[str, Any] = {
+    "shell": CAP["shell"] | {"hole": 10},
+    "boundary": {"hole": "clamped", "rim": "clamped"},
+    "bodies": {
+        "ball": {"kind": "sphere", "radius": 0.5, "position": [0, 0, 1.5], "direction": [0, 0, -1]}
+    },
+}
+RIM: dict[str, Any] = {
+    "shell": {"geometry": "disc", "radius_to_thickness": 20, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "bodies": {
+        "ball": {"kind": "sphere", "radius": 0.3, "position": [1, 0, 0.4], "direction": [0, 0, -1]}
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "place"), [(HOLE, r"\(0.1736, 0, 0.9848\)"), (RIM, r"\(1, 0, 0\)")]
+)
+def test_a_ball_on_a_clamped_edge(case: dict[str, Any], place: str) -> None:
+    """On a meridian and on a half: nothing gives way at the edge, whose place is named."""
+    loading = {"kind": "contact", "approach": 5, "points": 1}
+    data = case | {"mesh": {"degree": 3, "refinement": 0.3}, "loading": loading}
+    with pytest.raises(Stopped, match=f"the body ball presses on a held place, {place}, over R"):
+        list(follow(Scene(Case.from_source(data))))
