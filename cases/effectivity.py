@@ -60,6 +60,7 @@ ROWS = [
     Row("pole_indentation", "force@end", "force at a depth", 0.5, settings=POLE),
     Row("pole_indentation", "force@end", "the same, half", 0.5, 3, ("symmetry=half", *POLE)),
     Row("probing", "barrier", "energy barrier", 0.5),
+    Row("plate_contact", "force@end", "force on a body", 0.5),
     Row("balloon", "limit_load", "rubber, largest pressure", 0.5),
     Row("arch", "critical_field", "fold of a strip", 0.5),
     Row("strip_buckling", "critical_field", "pitchfork of a strip", 0.5, 2),
