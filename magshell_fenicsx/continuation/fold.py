@@ -418,8 +418,8 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
 
 def fold_by_one_step(
     newton: BorderedNewton, state: State, phi: Vector, name: str
-) -> tuple[State, Vector]:
-    """Return the fold near a good guess, and its null vector, by one factorisation. Collective.
+) -> tuple[State, Vector, int]:
+    """Return the fold near a good guess by one factorisation. Collective.
 
     After one step of Newton's method the amplitude is corrected, so that v . R = 0 with the null
     vector v there. What the step has left of the error of u changes it in second order alone.
@@ -428,6 +428,10 @@ def fold_by_one_step(
     ----------
     state, phi
         The guess, and a vector near its null vector.
+
+    Returns
+    -------
+    The state, its null vector, and the number of other unstable directions at the guess.
 
     Raises
     ------
@@ -447,7 +451,7 @@ def fold_by_one_step(
     load = system.load(found.u, found.mu, name)
     residual_along_v = dot(system.comm, v, system.residual(found.u, found.mu))
     correction = -residual_along_v / dot(system.comm, v, load)
-    return found.with_(found.u, name, found.mu[name] + correction), v
+    return found.with_(found.u, name, found.mu[name] + correction), v, tangent.unstable
 
 
 def residual_multiplier(system: System, fold: Fold) -> Vector:

@@ -71,6 +71,7 @@ LARGE_ERROR_WARNING = (
     "warning: the estimated error of {} is {:.2g} % of it, by the mesh: give a larger "
     "mesh.refinement, or mesh.tolerance"
 )
+OF_MESH = "with one degree more"  # what reasons begin with that the mesh may have
 ROUNDING = 1e-9  # over h: a smaller displacement is printed as zero
 
 
@@ -454,6 +455,9 @@ def _write_results(
             progress.doing("errors by one degree more")
             for name, error in result.large_errors.items():
                 output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
+            for name, reason in result.error_estimates.reasons.items():
+                if reason.startswith(OF_MESH):
+                    output.say(f"warning: no estimated error of {name}: {reason}")
         files.write_summary(summary(result, time.perf_counter() - output.start))
         if not interruption:
             progress.doing("modes and pictures")

@@ -70,6 +70,10 @@ SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue a
 ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
+OTHERS_FIRST = (
+    "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
+    "too coarse"
+)
 FAILURES = (
     CaseError,
     MeshError,
@@ -391,8 +395,10 @@ class Comparison:
         stage, guess = self._stage()
         du = with_higher_degree(self.scene, self.fine, self.record.point.du)
         phi = stage.padded(du)
-        state, fine_phi = fold_by_one_step(stage.newton, guess, phi, self.record.amplitude)
+        name = self.record.amplitude
+        state, fine_phi, unstable = fold_by_one_step(stage.newton, guess, phi, name)
         _refuse_other_mode(stage, phi, fine_phi)
+        self._refuse_later(unstable, self.record.point.negative_pivots)
         return stage.leave(state)
 
     def _own_bifurcation(self) -> State:
@@ -416,6 +422,7 @@ class Comparison:
             raise NotEstimated("with one degree more Newton's method finds no equilibrium")
         state, _ = held_state
         system, tangent = newton.system, AugmentedTangent(newton, state, b)
+        self._refuse_later(tangent.unstable, self.record.point.negative_pivots)
         w_mu, _ = tangent.solve(system.load(state.u, state.mu, name))
         cubic = third_derivative(system, state, tangent.v)
         K_mu_v = first_difference(
@@ -437,7 +444,9 @@ class Comparison:
         name, mu = self.record.amplitude, state.mu[self.record.amplitude]
         response = stage.newton.response(state, name, row)
         family = _family(self.fine, self.record.mode)
-        eigenvalue, v = nearest_to_zero(family.factor_at(stage.leave(state)))
+        factors = family.factor_at(stage.leave(state))
+        eigenvalue, v = nearest_to_zero(factors)
+        self._refuse_later(factors.negative_pivots - (eigenvalue < 0), self.record.excluded_pivots)
 
         def moved(dmu: float) -> State:
             """Return the state of the model further along the path."""
@@ -447,6 +456,23 @@ class Comparison:
         product = _tangent_times(family, moved(step), v)
         slope = (dot(self.fine.comm, v, product) - eigenvalue) / step
         return moved(-eigenvalue / slope)
+
+    def _refuse_later(self, unstable: int, unstable_before: int) -> None:
+        """Check that no other modes are unstable at an instability with one degree more.
+
+        Parameters
+        ----------
+        unstable, unstable_before
+            Number of other unstable directions with one degree more, and of all at the record, the
+            neutral one perhaps among them.
+
+        Raises
+        ------
+        NotEstimated
+            If there are more.
+        """
+        if unstable >= max(unstable_before, 1):
+            raise NotEstimated(OTHERS_FIRST)
 
 
 def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:

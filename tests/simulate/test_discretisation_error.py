@@ -48,10 +48,44 @@ def test_fold_of_half_a_shell() -> None:
     assert result.large_errors["knockdown"] == pytest.approx(0.012, abs=0.001)
 
 
+@pytest.mark.slow
 def test_waves_that_a_meridian_excludes() -> None:
     result = coarse_run("cylinder_waves.yaml")
     assert result.knockdown
     check_effectivity(result, "knockdown", result.knockdown, 0.113753163)
+
+
+@pytest.mark.slow
+def test_pitchfork_of_a_strip() -> None:
+    """A mode of the model itself; degree 4, refinement 1."""
+    settings = ["mesh.degree=2", "mesh.refinement=0.5"]
+    result = run(Case.load(CASES / "strip_buckling.yaml", settings))
+    assert result.critical_field
+    check_effectivity(result, "critical_field", result.critical_field, 2.05612717e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degree", "refinement"), [(3, 0.4), (4, 0.6)])
+def test_mode_that_a_half_excludes(degree: int, refinement: float) -> None:
+    """Antisymmetric; degree 5, refinement 0.9. The first mesh is 32 % off: it says so."""
+    around = {"a": [1.4, 0, 0], "b": [-1.4, 0, 0], "c": [0, 1.4, 0], "d": [0, -1.4, 0]}
+    held = {"a": ["x", "y", "z"], "b": ["y", "z"], "c": ["z"], "d": ["z"]}
+    torus = {"geometry": "torus", "radius": 1.0, "tube_radius": 0.4}
+    case = {
+        "shell": {**torus, "thickness": 0.08, "poisson_ratio": 0.3},
+        "points": around,
+        "boundary": {name: {"held": axes} for name, axes in held.items()},
+        "mesh": {"degree": degree, "refinement": refinement},
+        "loading": {"kind": "pressure", "until": "bifurcation"},
+    }
+    result = run(Case.from_source(case))
+    assert result.knockdown
+    assert result.limit_points[0]["mode"] == "antisymmetric"
+    if degree == 4:
+        check_effectivity(result, "knockdown", result.knockdown, 0.3732450)
+    else:
+        assert "knockdown" not in result.errors
+        assert "the mesh is too coarse" in result.error_estimates.reasons["knockdown"]
 
 
 def test_force_at_a_depth() -> None:
@@ -73,6 +107,7 @@ def test_critical_field_and_displacement_beyond_it() -> None:
     assert in_units == pytest.approx(field, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_frequencies(tmp_path: Path) -> None:
     """The sixth of the modes that are no rigid motions; these have no error."""
     result = run(Case.load(CASES / "free_plate.yaml", COARSE), tmp_path / "out", pictures=False)
@@ -108,6 +143,7 @@ def test_a_field_of_the_run_is_one_of_the_fine_scene(symmetry: str) -> None:
     assert volumes[0] == pytest.approx(volumes[1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_same_on_two_ranks_and_resumed(tmp_path: Path) -> None:
     """summary.json of two ranks, and of a run that stops and goes on, has the same errors."""
     case = CASES / "dimple_buckling.yaml"
