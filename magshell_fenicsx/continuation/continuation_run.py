@@ -458,8 +458,9 @@ class _InstabilityLocator:
             curvature = (opposite_end.dmu - point.dmu) / (opposite_end.s - point.s)
             # near its extremum mu(s) is a parabola, with this curvature
             load_error = abs(point.dmu**2 / (2 * curvature))
+            point = replace(point, load_error=load_error)
             if load_error <= self.tolerance * abs(mu):
-                return replace(point, load_error=load_error)
+                return point
             low, high = (point, high) if is_before else (low, point)
         return point
 

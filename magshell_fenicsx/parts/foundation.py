@@ -99,10 +99,8 @@ class Foundation(Part):
 
         Their amplitudes are the stiffnesses over E h/R².
         """
-        scales, stiffnesses = (
-            context.scales,
-            self._dimensionless(context.scales),
-        )  # those of "k" and "k_t" that are given
+        scales = context.scales
+        stiffnesses = self._dimensionless(scales)  # of "k" and "k_t", those that are given
         energies = list[OwnTerm]()
         factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
         # the springs along the normal also have a column of results, with the density `reaction`

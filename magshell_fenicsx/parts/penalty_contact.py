@@ -19,7 +19,7 @@ from magshell_fenicsx.parts.gap import SOFT_PENETRATION, Penalty
 Array = NDArray[np.float64]
 Configuration = TypeVar("Configuration")
 Frozen = TypeVar("Frozen")
-CROSSING_DISTANCE = 0.5  # thicknesses: faces that overlap by more pass through each other
+PASS_THROUGH_DISTANCE = 0.5  # thicknesses: faces that overlap by more pass through each other
 
 
 class PenaltyOptions(Protocol):

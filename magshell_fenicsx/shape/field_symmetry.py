@@ -19,11 +19,11 @@ from magshell_fenicsx.shape.meridian_chart import MeridianChart
 Array = NDArray[np.float64]
 FieldFunction: TypeAlias = Callable[[Array], Array]
 FIELD_TOLERANCE = 1e-9  # over the largest value: differences that are rounding
-# azimuths (rad) by the golden angle: nothing periodic meets them all, nor anything wider than 0.01
+# azimuths (rad) by the golden angle: no period fits them all; neighbours are at most 0.0122 apart
 ANGLES = [2.399963 * i for i in range(720)]
 SMOOTH_ANGLES, SMOOTH_STRIDE = 12, 20  # azimuths, and places passed over, for a smooth field
-MAX_OFFSET = 0.1  # over R, of the places beside the surface that it may move to
-OFFSET_SEED = 2026
+MAX_SHIFT = 0.1  # over R, along each axis: how far a place beside the surface may be from it
+SHIFT_SEED = 2026
 
 
 def formula_field(
@@ -82,7 +82,7 @@ def is_axisymmetric(
     meridian
         Meridian of the surface; None if it is no surface of revolution, which has no such field.
     in_space
-        Whether this is asked beside the surface too, up to `MAX_OFFSET` from it.
+        Whether this is asked beside the surface too, up to `MAX_SHIFT` from it.
     is_smooth
         Whether the field is as smooth as that of distant sources, so that few samples suffice.
     """
@@ -127,8 +127,8 @@ def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
 
 def with_nearby_places(x: Array) -> Array:
     """Return places (2 n, 3): the given ones, then one at random near each."""
-    offsets = np.random.default_rng(OFFSET_SEED).uniform(-1, 1, x.shape)
-    return np.vstack([x, x + MAX_OFFSET * offsets])
+    offsets = np.random.default_rng(SHIFT_SEED).uniform(-1, 1, x.shape)
+    return np.vstack([x, x + MAX_SHIFT * offsets])
 
 
 def equal_to_rounding(a: Array, b: Array) -> bool:

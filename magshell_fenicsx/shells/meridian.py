@@ -369,7 +369,7 @@ class MeridianModel(ThinModel):
         self.shell_contacts = self._make_shell_contacts()
         for contact in self.shell_contacts:
             # parameters that change a contact too, such as the thickness of a natural shape
-            parameters |= contact.entered(parameters)
+            parameters |= contact.growth_parameters(parameters)
         self.t_junction_terms = self._make_t_junctions()
         # requested now, taken below: the system's forms compile meanwhile
         volume_request = self.kernels.request_form("volume energy", underived(volume))

@@ -596,7 +596,7 @@ class ShellModel(ThinModel):
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         # parameters that change a contact too, such as the thickness of a natural shape
         for contact in self.shell_contacts:
-            parameters |= contact.entered(parameters)
+            parameters |= contact.growth_parameters(parameters)
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, residual)
         return parameters

@@ -98,9 +98,9 @@ class ErrorEstimates:
     Attributes
     ----------
     errors
-        Name of a result -> its estimated absolute error. Names are "knockdown" and
-        "critical_field", "limit_load" (the first value of `limit_points`), and COLUMN@end, a column
-        of path.csv at the last point. Also "barrier", and "omega2_1" and so on at the last point.
+        Name of a result -> its estimated absolute error. Names: "knockdown", "critical_field",
+        "limit_load" (the first value of `limit_points` in summary.json) and "barrier"; at the last
+        point COLUMN@end of columns of path.csv, and "omega2_1", "omega2_2" and so on.
     reasons
         Name of a result, "end" for all at the last point -> why it has no estimate.
     """
@@ -149,7 +149,7 @@ def estimate_errors(scene: Scene, history: History) -> ErrorEstimates:
                 fine_scenes.comparison(scene, record) for record in (history.begin, history.last)
             )
             if begin.fine is not last.fine:
-                raise NotEstimated("its begin is in another model")
+                raise NotEstimated("the step begins in another model")
             change = last.barrier_from(begin)
             estimates.errors["barrier"] = _estimated(change)
     return estimates
@@ -185,7 +185,7 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
     errors, ranks = dict[str, float](), Counter[str]()
     for number, mode in enumerate(modes, 1):
         of_label = [each.eigenvalue for each in fine_modes if each.label == mode.label]
-        if mode.eigenvalue and ranks[mode.label] < len(of_label):  # a rigid motion is exact
+        if mode.eigenvalue and ranks[mode.label] < len(of_label):  # zero of a rigid motion is exact
             change = of_label[ranks[mode.label]] - mode.eigenvalue
             errors[f"omega2_{number}"] = _estimated(change)
         ranks[mode.label] += 1
@@ -323,7 +323,7 @@ class Comparison:
         changes = {
             column: after[column] - value
             for column, value in before.items()
-            if isfinite(value) and max(abs(value), abs(after[column])) > ROUNDING
+            if isfinite(value + after[column]) and max(abs(value), abs(after[column])) > ROUNDING
         }
         return changes | self.scene.sizes.values(changes)
 
@@ -404,8 +404,9 @@ class Comparison:
     def _own_bifurcation(self) -> State:
         """Return the state where a mode of the model itself is neutral, near the record.
 
-        A force along the mode keeps the state on the path. With the bordered tangent K v + g b = 0,
-        b . v = 1, one step of Newton's method for g = 0 along the path follows.
+        A force along the mode b holds the displacement along b near the point, so that the tangent
+        stays regular. The mode is neutral where K v + g b = 0, b . v = 1 gives g = 0: one step of
+        Newton's method along the path goes there.
 
         Raises
         ------
@@ -486,7 +487,7 @@ def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:
     u, v = (stage.displacement(x) for x in (phi, fine_phi))
     comm = stage.scene.comm
     if dot(comm, u, v) ** 2 < MIN_COSINE**2 * dot(comm, u, u) * dot(comm, v, v):
-        raise NotEstimated("with one degree more the instability near by has another mode")
+        raise NotEstimated("with one degree more the instability nearby has another mode")
 
 
 def _family(scene: Scene, label: str) -> ModeFamily:

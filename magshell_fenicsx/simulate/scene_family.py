@@ -527,8 +527,10 @@ class SceneFamily:
         return self._problems[p]
 
     def _stage(self, p: float) -> Stage:
-        """Return the stage of the scene at p; the latest `MAX_STAGES` are remembered."""
-        stage = self._stages.pop(p, None)  # put back at the end: the least used is the first
+        """Return the stage of the scene at p; the `MAX_STAGES` most recently used are kept."""
+        stage = self._stages.pop(
+            p, None
+        )  # put back at the end: the least recently used is the first
         if stage is None:
             scene = self._scene(p)
             # a system with further unknowns or parameters, as that of the base; or the model's own

@@ -38,7 +38,7 @@ from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
 from magshell_fenicsx.parts.gap import ThicknessRatio, thickness_ratio
 from magshell_fenicsx.parts.penalty_contact import (
-    CROSSING_DISTANCE,
+    PASS_THROUGH_DISTANCE,
     GapAlongStep,
     PenaltyContact,
 )
@@ -554,7 +554,7 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
             gaps, _, _ = self.contact.gap(x + part * (y - x), approach=0.0, half=half)
             return float(self.comm.allreduce(float(gaps.min(initial=np.inf)), MPI.MIN))
 
-        crossing_distance = CROSSING_DISTANCE * self._h
+        crossing_distance = PASS_THROUGH_DISTANCE * self._h
         return GapAlongStep(gap, largest_approach, crossing_distance) if largest_approach else None
 
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:

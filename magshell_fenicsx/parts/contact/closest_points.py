@@ -575,7 +575,7 @@ class ClosestPointSearch:
         return np.asarray(np.repeat(is_left, np.diff([*first, len(places.point)])))
 
     def are_edges_alone(self, points: ContactPoints, nearest: Projections, normals: Array) -> Flags:
-        """Return flags (n,): whose points belong to an edge that presses on a face alone.
+        """Return flags (n,): points on an edge that presses on a face whose own do not count.
 
         Such a point faces the inside of a surface that is steep to its own. The points of that
         surface do not count there, since an edge would catch at each of them as it slides.

@@ -253,7 +253,7 @@ class MeridianContact(PairContact[MeridianProjections]):
         rows, columns, values = self._block_entries(blocks, nodes, of_place=[0, 1, 2])
         if self._meridian_offsets:
             # by the chain rule: entries by (U, V, W) and offsets become those by (U, V, W) alone
-            offsets, by_offset = self._meridian_offsets.waves(m), self._forces()[:, -1]
+            offsets, by_offset = self._meridian_offsets.waves(m), self._gradient()[:, -1]
             rows, columns, values = offsets.entries(self._at, (rows, columns, values), by_offset)
         # from (U, V, W) to (P, V, W) with P = U + V. The derivative by V at fixed P is that by V
         # less that by U: each entry of U stays as one of P, and is subtracted from V, the next

@@ -2,13 +2,13 @@
 
 Both members of a pair have contact points, quadrature points of their cells. A point faces places,
 its closest places on the other member; on surfaces and on meridians these come from projections of
-their own. The gap of a place is d - h, with the distance d of faces plus h; the penetration is
-h - d. Both members have points, so that each has half of the penalty. Of the energy
+their own. The distance d of a place is the gap of the faces plus h: the gap is d - h, and the
+penetration h - d. Both members have points, so that each has half of the penalty. Of the energy
 
     Pi = 1/2 sum area psi(h - d)   over places in contact
 
-the forces are -1/2 sum area psi' d,u, and the tangent is 1/2 sum area (psi'' d,u d,u - psi' d,uu).
-docs/theory.md, Contact.
+the gradient, minus the forces on the shells, is -1/2 sum area psi' d,u, and the tangent is
+1/2 sum area (psi'' d,u d,u - psi' d,uu). docs/theory.md, Contact.
 
 Where the thickness varies, half of it H at nodes is one more unknown, the offset (`FaceOffsets`).
 A sample is a displacement within a step in time. A frozen contact keeps the active set of one state
@@ -56,7 +56,7 @@ from magshell_fenicsx.parts.contact.time_averaging import (
     at_each_sample,
     samples_of_step,
 )
-from magshell_fenicsx.parts.penalty_contact import CROSSING_DISTANCE, PenaltyContact
+from magshell_fenicsx.parts.penalty_contact import PASS_THROUGH_DISTANCE, PenaltyContact
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -153,8 +153,8 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
 
     amplitude = None
     column = ""
-    max_stiffening = 1e6  # the point of a corner has a small weight
-    bound_at_points = 0.75  # between points, with other cuts, shells may be deeper
+    max_stiffening = 1e6  # high: a point at a corner has a small weight, and so a small force
+    bound_at_points = 0.75  # shells may be deeper between the points
     # along which components all cells can move without a change of gaps
     common_translations: Sequence[float] = (1.0, 1.0, 1.0)
     _points: ContactPoints | MeridianPoints
@@ -270,7 +270,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor dPi/du to the vector b; collective."""
-        forces = at_each_sample(self, self._forces_on_nodes)
+        forces = at_each_sample(self, self._gradient_by_displacement)
         self._add(b, factor * np.sum(forces, axis=0))
 
     def compile_residual(self) -> None:
@@ -301,8 +301,10 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         # an offset depends on the nodes of all cells around it, which are then coupled too
         return self._offsets.coupled_pairs(rows, columns)
 
-    def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
-        """Return the free parameters on which the faces depend, with this term's derivatives.
+    def growth_parameters(
+        self, parameters: Mapping[str, FreeParameter]
+    ) -> dict[str, FreeParameter]:
+        """Return those parameters that move faces, with the derivatives of contact added.
 
         Only the natural stretch moves faces, through the thickness of a shell that has grown. The
         result has this parameter alone, with the contact forces added to its derivatives; it is
@@ -366,7 +368,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             u=self._at,
             offsets=self._offsets,
             active=active,
-            forces=self._forces(),
+            forces=self._gradient(),
             find_entries_by_place_and_offset=self._entries_by_place_and_offset,
             find_entries=self._entries,
             find_geometry=lambda: self._gap_geometry(active.places),
@@ -375,7 +377,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
 
     # forces and tangent at one sample
 
-    def _forces(self) -> Array:
+    def _gradient(self) -> Array:
         """Return the derivative (nodes, dim) of this rank's energy by the places of all nodes.
 
         Where the thickness varies, one more component is the derivative by the offset H.
@@ -393,12 +395,12 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             np.add.at(forces, nodes, -force_of_places[:, None, None] * slopes)
         return forces
 
-    def _forces_on_nodes(self) -> Array:
+    def _gradient_by_displacement(self) -> Array:
         """Return the derivative (nodes, dim) by the displacement, on which H depends; collective.
 
         It is that of this rank's energy.
         """
-        forces = self._forces()  # which sets `_at` to its displacement
+        forces = self._gradient()  # which sets `_at` to its displacement
         return forces_on_nodes(self._offsets, self._at, forces)
 
     def _entries(self) -> Entries:
@@ -408,7 +410,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             return entries
         # offsets depend on the displacement: by the chain rule, which needs the derivative of the
         # energy by offsets, the entries become those by the displacement alone
-        by_offset = self._forces()[:, -1]
+        by_offset = self._gradient()[:, -1]
         return self._offsets.entries(self._at, entries, by_offset)
 
     # what is observed
@@ -467,11 +469,10 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             )
 
     def gap_at_supports(self, supported_nodes: Longs) -> float:
-        """Return the least gap over R between the faces at supported nodes, where faces overlap.
+        """Return the least gap over R of overlapping faces at supported nodes; inf if none overlap.
 
-        Only nodes count that may touch and are not the same material. The result is negative if
-        faces overlap there, and infinite if none do. It is also infinite if the thickness depends
-        on the displacement: such a displacement is not looked at. Collective.
+        It is negative. Only nodes count that may touch and are not the same material. Where the
+        thickness depends on the displacement nothing is checked, and the result is inf. Collective.
 
         Parameters
         ----------
@@ -593,7 +594,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         # points pass through if mid-surfaces are very near at a sample between the parts; both ends
         # of the way are states, where no member has passed through another
-        reach = CROSSING_DISTANCE * least_thickness
+        reach = PASS_THROUGH_DISTANCE * least_thickness
         for k in range(1, count):
             near_places = self._projections_of_midsurfaces(u + k / count * (v - u), reach)
             if self._comm.allreduce(len(near_places.point)):
@@ -694,7 +695,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         raise NotImplementedError
 
     def _are_edges_alone(self, nearest: Places) -> Flags:
-        """Return flags (n,): whose points belong to an edge that presses on a face alone."""
+        """Return flags (n,): points on an edge that presses on a face whose own do not count."""
         raise NotImplementedError
 
     def _places_within_reach(self) -> Places:
@@ -710,7 +711,7 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         raise NotImplementedError
 
     def deepest_penetration(self) -> tuple[float, Array]:
-        """Return the largest penetration over R, and the place (3,) of its point; collective.
+        """Return the largest penetration, and the point (3,) where it is, both over R; collective.
 
         Without contact they are 0 and the origin.
         """

@@ -65,7 +65,7 @@ from magshell_fenicsx.parts.contact.projection import (
 )
 from magshell_fenicsx.parts.contact.segments import ContactPoints, Cuts, Segments, divisions_of
 from magshell_fenicsx.parts.contact.time_averaging import SampleCache
-from magshell_fenicsx.parts.penalty_contact import CROSSING_DISTANCE, GapAlongStep
+from magshell_fenicsx.parts.penalty_contact import PASS_THROUGH_DISTANCE, GapAlongStep
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -349,7 +349,7 @@ class SurfaceContact(PairContact[Projections]):
             """Return the least gap after a part of the way."""
             return self.gap(begin + part * (end - begin))
 
-        return GapAlongStep(gap, largest_approach, CROSSING_DISTANCE * self.least_thickness())
+        return GapAlongStep(gap, largest_approach, PASS_THROUGH_DISTANCE * self.least_thickness())
 
     def gap(self, u: Array) -> float:
         """Return the least gap over R of the uncut cells at a displacement of all; collective.

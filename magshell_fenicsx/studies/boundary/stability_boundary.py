@@ -45,7 +45,7 @@ from magshell_fenicsx.simulate.scene_family import SceneFamily, first_instabilit
 from magshell_fenicsx.studies.boundary.journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary.picture import draw_boundary
 from magshell_fenicsx.studies.boundary.start import Start, start_from
-from magshell_fenicsx.studies.boundary.varied_case import Range, VariedCase, parse_range
+from magshell_fenicsx.studies.boundary.varied_case import VariedCase, VariedKey, parse_range
 from magshell_fenicsx.studies.naming import load_text
 from magshell_fenicsx.studies.points import MakeCase
 from magshell_fenicsx.studies.runner import Say, compute, remaining_time_text, reporting_progress
@@ -429,7 +429,7 @@ def _scene_family(varied: VariedCase, value: float, begin: dict[str, Any]) -> Sc
         raise CaseError(f"--over {span.key}: {e}") from None
 
 
-def _text_of_row(row: dict[str, Any], span: Range, name: str) -> str:
+def _text_of_row(row: dict[str, Any], span: VariedKey, name: str) -> str:
     """Return a row of boundary.csv as a line of text.
 
     Parameters
@@ -497,7 +497,7 @@ def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
 def _put_together(
     outcomes: dict[int, dict[str, Any]],
     begin: dict[str, Any],
-    span: Range,
+    span: VariedKey,
     name: str,
     settings: Sequence[str],
 ) -> StabilityBoundary:
@@ -545,7 +545,7 @@ def _put_together(
     return StabilityBoundary(rows, content)
 
 
-def _sentence_of_special(row: dict[str, Any], span: Range, name: str) -> str:
+def _sentence_of_special(row: dict[str, Any], span: VariedKey, name: str) -> str:
     """Describe a special point of the boundary, such as a cusp, in words.
 
     Parameters
@@ -564,7 +564,7 @@ def _sentence_of_special(row: dict[str, Any], span: Range, name: str) -> str:
     return f"{place}, {load_text(row, name)}: {words}{modes}"
 
 
-def _sentences_of_unreached_ends(rows: list[dict[str, Any]], span: Range) -> list[str]:
+def _sentences_of_unreached_ends(rows: list[dict[str, Any]], span: VariedKey) -> list[str]:
     """Return a sentence for each end of the range that a boundary does not reach.
 
     If nothing has stopped the boundary, it turns back before such an end.

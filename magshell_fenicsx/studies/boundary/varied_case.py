@@ -17,12 +17,12 @@ from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.perturbation import KEYS_OUTSIDE_THE_MODEL
 from magshell_fenicsx.studies.points import MakeCase, value_at
 
-FORMS = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
-STEPS, MOST_STEPS = 20, 1000
+FORM_HINT = "write it as key.path=first:last or key.path=first:last:steps, with numbers of one unit"
+DEFAULT_STEPS, MAX_STEPS = 20, 1000
 
 
 @dataclass(frozen=True)
-class Range:
+class VariedKey:
     """The key of a case that varies, and its range.
 
     Attributes
@@ -51,7 +51,7 @@ class Range:
         return f"{float(value)!r} {self.unit}".rstrip()
 
 
-def parse_range(text: str) -> Range:
+def parse_range(text: str) -> VariedKey:
     """Read `--over`, the key of a boundary and its range.
 
     Raises
@@ -62,7 +62,7 @@ def parse_range(text: str) -> Range:
     Examples
     --------
     >>> parse_range("magnetic.applied.flux_density=-40mT:0.04T")
-    Range(key='magnetic.applied.flux_density', first=-40.0, last=40.0, unit='mT', steps=20)
+    VariedKey(key='magnetic.applied.flux_density', first=-40.0, last=40.0, unit='mT', steps=20)
     >>> parse_range("foundation.stiffness=0:1e-3:40").steps
     40
     """
@@ -75,19 +75,19 @@ def parse_range(text: str) -> Range:
         # the unit of the first bound that has one counts for both
         unit = number_and_unit(bounds_and_steps[0])[1] or number_and_unit(bounds_and_steps[1])[1]
         first, last = (in_unit(bound, unit) for bound in bounds_and_steps[:2])
-        steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else STEPS
+        steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else DEFAULT_STEPS
     except ValueError:
-        raise CaseError(f"--over {text}: {FORMS}") from None
+        raise CaseError(f"--over {text}: {FORM_HINT}") from None
     if not np.isfinite([first, last]).all() or first == last:
         raise CaseError(f"--over {text}: first and last must be two different finite numbers")
-    if not 1 <= steps <= MOST_STEPS:
-        raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
+    if not 1 <= steps <= MAX_STEPS:
+        raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MAX_STEPS}")
     if key.split(".")[0] in KEYS_OUTSIDE_THE_MODEL:
         raise CaseError(
             f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has "
             "no boundary"
         )
-    return Range(key, first, last, unit, steps)
+    return VariedKey(key, first, last, unit, steps)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class VariedCase:
     """
 
     source: Source
-    span: Range
+    span: VariedKey
     make_case: MakeCase
 
     def start_value(self, *, may_be_outside: bool) -> float:
@@ -165,7 +165,7 @@ class VariedCase:
         return with_modes(problem, MPI.COMM_SELF) if problem.pending_modes else problem
 
     def identity(self, start: str) -> str:
-        """Return a hash of case, range and the text of the start, for names of journals."""
+        """Return a hash of the case, the range and the start of its boundary; journals have it."""
         case = self.make_case(self.source)
         data = [
             case.model_dump(mode="json") | case.outside,
