@@ -52,7 +52,7 @@ from magshell_fenicsx.continuation.system import State, Vector, dot, symmetric_p
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.quantities.registry import AMPLITUDES, OWN_MODES, amplitude
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.shells.waves import WaveFamily
 from magshell_fenicsx.simulate.adapt.ending import History, at_target
@@ -201,7 +201,9 @@ def _instabilities(scene: Scene, history: History) -> list[tuple[Record, dict[st
     """Return the instabilities that are results, each with name of the result -> its column."""
     columns_of = dict[int, dict[str, str]]()
     held = {step.number for step in scene.problem.programme if step.name in step.load.hold}
-    for name, mu in (("knockdown", "pressure"), ("critical_field", "lambda_m"), ("limit_load", "")):
+    # name of a result -> the load that has it; "" for any load
+    load_of_result = {a.critical_names[0]: a.name for a in AMPLITUDES.values() if a.critical_names}
+    for name, mu in {**load_of_result, "limit_load": ""}.items():
         for number, record in enumerate(history.located):
             at_held_volume = name == "knockdown" and record.step in held
             if mu in ("", record.amplitude) and not at_held_volume:
