@@ -46,6 +46,7 @@ from magshell_fenicsx.runs.rows import RowMaker, imbalances, motion_errors
 from magshell_fenicsx.runs.status import RunProgress, status_line
 from magshell_fenicsx.runs.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.ending import NoResult
+from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
@@ -71,7 +72,7 @@ LARGE_ERROR_WARNING = (
     "warning: the estimated error of {} is {:.2g} % of it, by the mesh: give a larger "
     "mesh.refinement, or mesh.tolerance"
 )
-OF_MESH = "with one degree more"  # what reasons begin with that the mesh may have
+NOT_REACHED = "the run ended before its errors were estimated"
 ROUNDING = 1e-9  # over h: a smaller displacement is printed as zero
 
 
@@ -451,24 +452,38 @@ def _write_results(
     result.replayed = files.journal.replayed
     pictures = output.pictures and not interruption  # an interrupted run draws none
     try:
+        # what follows may fail: the results are on disk before
+        unestimated = ErrorEstimates(reasons={"all": NOT_REACHED})
+        files.write_summary(summary(result, unestimated, time.perf_counter() - output.start))
         if not interruption:
             progress.doing("errors by one degree more")
-            for name, error in result.large_errors.items():
-                output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
-            for name, reason in result.error_estimates.reasons.items():
-                if reason.startswith(OF_MESH):
-                    output.say(f"warning: no estimated error of {name}: {reason}")
-        files.write_summary(summary(result, time.perf_counter() - output.start))
-        if not interruption:
+            _estimate_errors(result, output)
             progress.doing("modes and pictures")
             _write_after_run(result, folder, output.comm, output.say, pictures)
-            # again, with the time of the pictures
-            files.write_summary(summary(result, time.perf_counter() - output.start))
+            estimates = result.error_estimates
+            files.write_summary(summary(result, estimates, time.perf_counter() - output.start))
         access_disk(output.comm, partial(write_report, folder, playable=pictures))
     except DiskError as e:
         interruption = interruption or e
     files.close(complete=not interruption and not result.stopped)
     return interruption
+
+
+def _estimate_errors(result: Result, output: RunOutput) -> None:
+    """Estimate the errors of the results, and print warnings about them; collective.
+
+    A run that has been asked to stop, or is at its time limit, has no estimates.
+    """
+    try:
+        output.watch.check()
+    except Interrupted as e:
+        result.error_estimates = ErrorEstimates(reasons={"all": str(e)})
+        return
+    for name, error in result.large_errors.items():
+        output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
+    estimates = result.error_estimates
+    for name in estimates.too_coarse:
+        output.say(f"warning: no estimated error of {name}: {estimates.reasons[name]}")
 
 
 def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:

@@ -216,12 +216,11 @@ class Result:
         The first access is collective, and solves with one degree more on the same mesh.
         """
         # a run whose errors nobody asks for does without
-        from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates, estimate_errors
+        from magshell_fenicsx.simulate.discretisation_error import estimate_errors
 
-        if self.stopped:
-            return ErrorEstimates(reasons={"end": "the run stopped early"})
-        estimates, with_units = estimate_errors(self.scene, self.path_history), in_units(self)
-        errors = estimates.errors
+        has_stopped = bool(self.stopped)
+        estimates = estimate_errors(self.scene, self.path_history, has_stopped=has_stopped)
+        errors, with_units = estimates.errors, in_units(self)
         # the same errors of results in units
         for name, number in self._main_results.items():
             for key in IN_UNITS[name] & with_units.keys():
@@ -375,10 +374,15 @@ class Result:
             return None
 
 
-def summary(result: Result, total_s: float) -> dict[str, Any]:
+def summary(result: Result, estimates: "ErrorEstimates", total_s: float) -> dict[str, Any]:
     """Return the content of summary.json of a run; collective.
 
-    `total_s` is the time of the run in seconds.
+    Parameters
+    ----------
+    estimates
+        Estimated errors of the results.
+    total_s
+        Time of the run in seconds.
     """
     scene = result.scene
     # the problem as the case has it, before its mesh was adapted
@@ -411,8 +415,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "knockdown": result.knockdown,
         "critical_field": result.critical_field,
         "barrier": result.barrier,
-        "errors": result.errors,
-        "errors_not_estimated": result.error_estimates.reasons,
+        "errors": estimates.errors,
+        "errors_not_estimated": estimates.reasons,
         "snaps": snaps_of_run,
         **snap_times,
         **observed,

@@ -26,7 +26,6 @@ from math import isfinite
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import (
     ConstraintRow,
@@ -35,22 +34,17 @@ from magshell_fenicsx.continuation.control import (
 )
 from magshell_fenicsx.continuation.fold import (
     AugmentedTangent,
-    FoldLost,
     first_difference,
     fold_by_one_step,
     held_along,
     third_derivative,
 )
 from magshell_fenicsx.continuation.modes import (
-    ModesNotFound,
-    NoEigenpair,
     critical_mode,
     nearest_to_zero,
 )
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State, Vector, dot, symmetric_part
-from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.quantities.registry import AMPLITUDES, OWN_MODES, amplitude
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
@@ -59,13 +53,14 @@ from magshell_fenicsx.simulate.adapt.ending import History, at_target
 from magshell_fenicsx.simulate.adapt.tolerance import SAFETY
 from magshell_fenicsx.simulate.contact_control import with_cuts_here
 from magshell_fenicsx.simulate.path_records import LOCATED
-from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import barrier
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.scene import Scene, beyond_memory
 from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 from magshell_fenicsx.simulate.stage import Stage, load_stage
 from magshell_fenicsx.simulate.steps import stage_of_step
 
+MAX_LOAD_CHANGE = 0.5  # over the load: an instability farther away is another one
 SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue along the path
 ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
@@ -74,21 +69,14 @@ OTHERS_FIRST = (
     "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
     "too coarse"
 )
-FAILURES = (
-    CaseError,
-    MeshError,
-    Stopped,
-    FoldLost,
-    NoEigenpair,
-    ModesNotFound,
-    np.linalg.LinAlgError,
-    ValueError,
-    PETSc.Error,
-)
 
 
 class NotEstimated(RuntimeError):
     """A result has no estimate of its error; the message says why."""
+
+
+class TooCoarse(NotEstimated):
+    """One degree more has no such result nearby: the mesh of the run may be too coarse."""
 
 
 @dataclass
@@ -103,21 +91,27 @@ class ErrorEstimates:
         point COLUMN@end of columns of path.csv, and "omega2_1", "omega2_2" and so on.
     reasons
         Name of a result, "end" for all at the last point -> why it has no estimate.
+    too_coarse
+        Those of these names for which the mesh may be too coarse.
     """
 
     errors: dict[str, float] = field(default_factory=dict)
     reasons: dict[str, str] = field(default_factory=dict)
+    too_coarse: list[str] = field(default_factory=list)
 
     @contextmanager
     def naming(self, *names: str) -> Iterator[None]:
         """Note the reason for some results where their estimate fails inside `with`."""
         try:
             yield
-        except (NotEstimated, *FAILURES) as e:
-            self.reasons |= dict.fromkeys(names, str(e) or type(e).__name__)
+        except NotEstimated as e:
+            self.reasons |= dict.fromkeys(names, str(e))
+            self.too_coarse += names if isinstance(e, TooCoarse) else ()
+        except Exception as e:  # whatever it is: the run has its results, and the summary names it
+            self.reasons |= dict.fromkeys(names, f"{type(e).__name__}: {e}".rstrip(": "))
 
 
-def estimate_errors(scene: Scene, history: History) -> ErrorEstimates:
+def estimate_errors(scene: Scene, history: History, *, has_stopped: bool = False) -> ErrorEstimates:
     """Return the estimated errors of the results of a run; collective.
 
     Parameters
@@ -126,15 +120,20 @@ def estimate_errors(scene: Scene, history: History) -> ErrorEstimates:
         The first scene of the run.
     history
         The records of the run.
+    has_stopped
+        Whether the run stopped before its end: then only instabilities are results.
     """
     estimates, fine_scenes = ErrorEstimates(), _FineScenes()
     for record, columns in _instabilities(scene, history):
         with estimates.naming(*columns):
             changes = fine_scenes.comparison(scene, record).changes
             estimates.errors |= {
-                name: _estimated(changes[column], record.point.load_error)
+                name: _estimated(changes.get(column, 0.0), record.point.load_error)
                 for name, column in columns.items()
             }
+    if has_stopped:
+        estimates.reasons["end"] = "the run stopped early"
+        return estimates
     end = history.end
     if end and end.amplitude:
         with estimates.naming("end"):
@@ -169,8 +168,8 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
 
     Raises
     ------
-    NotEstimated, or one of `FAILURES`
-        If the state or the modes are not found with one degree more.
+    NotEstimated
+        If they cannot be compared; and other errors if the state or the modes are not found.
     """
     _refuse(scene, record)
     if scene.model.contacts or scene.model.shell_contacts:
@@ -265,13 +264,16 @@ def fine_scene(scene: Scene) -> Scene:
     CaseError
         If both do not fit into memory together.
     NotEstimated
-        If the cells of the mesh are in another order.
+        If they come near the memory, or the cells of the mesh are in another order.
     """
     problem, degree = problem_on_mesh_of(scene, scene.problem), scene.model.degree
     mesh = problem.mesh.model_copy(update={"degree": degree + 1})
     # those of both scenes, which are in memory at once
     unknowns = problem.unknowns * (1 + ((degree + 1) / degree) ** 2)
-    fine = Scene(replace(problem, mesh=mesh, unknowns=unknowns), scene.comm)
+    fine_problem = replace(problem, mesh=mesh, unknowns=unknowns)
+    if warning := beyond_memory(fine_problem, scene.comm):
+        raise NotEstimated(warning)
+    fine = Scene(fine_problem, scene.comm)
     cells, fine_cells = (s.model.V.mesh.topology.original_cell_index for s in (scene, fine))
     if not scene.comm.allreduce(np.array_equal(cells, fine_cells), MPI.LAND):
         raise NotEstimated("the cells of the mesh are in another order")
@@ -389,7 +391,7 @@ class Comparison:
             row = PrescribedConjugate(system, name, held_value)
         outcome = stage.newton.solve(guess, name, row)
         if not outcome.converged:
-            raise NotEstimated(f"with one degree more: {outcome.reason}")
+            raise TooCoarse(f"with one degree more: {outcome.reason}")
         return stage, outcome.state, row
 
     def _fold(self) -> State:
@@ -413,7 +415,7 @@ class Comparison:
         Raises
         ------
         NotEstimated
-            If the load changes along the branch.
+            If the load changes along the branch, or no neutral mode is nearby.
         """
         if self.record.mode == "asymmetric":
             raise NotEstimated("a bifurcation at which the load changes along the branch")
@@ -422,7 +424,7 @@ class Comparison:
         b = critical_mode(newton, guess).vector
         held_state = held_along(newton, guess, b)
         if held_state is None:
-            raise NotEstimated("with one degree more Newton's method finds no equilibrium")
+            raise TooCoarse("with one degree more Newton's method finds no equilibrium")
         state, _ = held_state
         system, tangent = newton.system, AugmentedTangent(newton, state, b)
         self._refuse_later(tangent.unstable, self.record.point.negative_pivots)
@@ -432,7 +434,7 @@ class Comparison:
             lambda u: system.load(u, state.mu, name), system, state.u, tangent.v
         )
         slope = dot(system.comm, cubic, w_mu) - dot(system.comm, tangent.v, K_mu_v)
-        dmu = -tangent.g / slope
+        dmu = _load_change(-tangent.g, slope, state.mu[name])
         return stage.leave(state.with_(state.u - dmu * w_mu, name, state.mu[name] + dmu))
 
     def _excluded_bifurcation(self) -> State:
@@ -441,7 +443,7 @@ class Comparison:
         Raises
         ------
         NotEstimated
-            If the modes have no tangent of their own, or the eigenvalue does not change.
+            If the modes have no tangent of their own, or none is neutral nearby.
         """
         stage, state, row = self._equilibrium()
         name, mu = self.record.amplitude, state.mu[self.record.amplitude]
@@ -458,7 +460,7 @@ class Comparison:
         step = SLOPE_STEP * (abs(mu) or 1.0)
         product = _tangent_times(family, moved(step), v)
         slope = (dot(self.fine.comm, v, product) - eigenvalue) / step
-        return moved(-eigenvalue / slope)
+        return moved(_load_change(-eigenvalue, slope, mu))
 
     def _refuse_later(self, unstable: int, unstable_before: int) -> None:
         """Check that no other modes are unstable at an instability with one degree more.
@@ -466,16 +468,37 @@ class Comparison:
         Parameters
         ----------
         unstable, unstable_before
-            Number of other unstable directions with one degree more, and of all at the record, the
-            neutral one perhaps among them.
+            Number of other unstable directions with one degree more, and of all at the record, with
+            or without the neutral one: a first instability has 0 or 1.
 
         Raises
         ------
         NotEstimated
             If there are more.
         """
-        if unstable >= max(unstable_before, 1):
-            raise NotEstimated(OTHERS_FIRST)
+        if unstable > unstable_before or unstable_before <= 1 <= unstable:
+            raise TooCoarse(OTHERS_FIRST)
+
+
+def _load_change(eigenvalue_change: float, slope: float, load: float) -> float:
+    """Return the change of a load that changes an eigenvalue by a given amount.
+
+    Parameters
+    ----------
+    slope
+        Derivative of the eigenvalue by the load, along the path.
+    load
+        The load, which sets what is nearby.
+
+    Raises
+    ------
+    TooCoarse
+        If the change is large, or the eigenvalue does not depend on the load.
+    """
+    bound = MAX_LOAD_CHANGE * (abs(load) or 1.0)
+    if not abs(eigenvalue_change) < bound * abs(slope):
+        raise TooCoarse("with one degree more no mode is neutral nearby")
+    return eigenvalue_change / slope
 
 
 def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:
@@ -489,7 +512,7 @@ def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:
     u, v = (stage.displacement(x) for x in (phi, fine_phi))
     comm = stage.scene.comm
     if dot(comm, u, v) ** 2 < MIN_COSINE**2 * dot(comm, u, u) * dot(comm, v, v):
-        raise NotEstimated("with one degree more the instability nearby has another mode")
+        raise TooCoarse("with one degree more the instability nearby has another mode")
 
 
 def _family(scene: Scene, label: str) -> ModeFamily:

@@ -210,7 +210,7 @@ class Scene:
             )
         self.problem, self.comm = problem, comm
         on_first_rank(comm, check_compiler)
-        warnings = (*self.problem.warnings, _beyond_memory(self.problem, comm))
+        warnings = (*self.problem.warnings, beyond_memory(self.problem, comm))
         self.warnings = [warning for warning in warnings if warning]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:
@@ -539,7 +539,7 @@ class Scene:
         return next((unit for unit in units if unit is not None), 0.0)
 
 
-def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
+def beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
     """Return a warning if a problem comes near the machine's memory, else None; collective.
 
     Every rank asks its own machine. If one of them has too little memory, all ranks raise the same

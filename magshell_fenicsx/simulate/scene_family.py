@@ -528,9 +528,7 @@ class SceneFamily:
 
     def _stage(self, p: float) -> Stage:
         """Return the stage of the scene at p; the `MAX_STAGES` most recently used are kept."""
-        stage = self._stages.pop(
-            p, None
-        )  # put back at the end: the least recently used is the first
+        stage = self._stages.pop(p, None)  # put back at the end: the first is the least recent
         if stage is None:
             scene = self._scene(p)
             # a system with further unknowns or parameters, as that of the base; or the model's own

@@ -16,6 +16,7 @@ A sample is a displacement within a step in time. A frozen contact keeps the act
 E h R^2, forces over E h R, pressures over E h/R, lengths over R.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic
@@ -650,73 +651,74 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
 
     # what depends on the geometry
 
+    @abstractmethod
     def _places_in_contact(self) -> tuple[Places, JoinedPlaces]:
         """Return the places in contact at the present state or sample, and how they are joined.
 
         They are cached while the state stays. `_at`, `_growth` and `_points` become those of this
         state. Collective.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def _follow(self, places: Places) -> Places:
         """Return places of a frozen contact moved, in their cells, to where points project now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _own_points(self, frozen: FrozenContact[Places]) -> ContactPoints | MeridianPoints:
         """Return the points of a frozen contact with the weights of this undeformed shell."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _gap_geometry(self, places: Places) -> Geometry:
         """Return distances, normals, beta and nodes of n places at the last active set's state."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _entries_by_place_and_offset(self) -> Entries:
         """Return this rank's entries of the second derivative by places and offsets; collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _coupled_cells(self) -> Longs:
         """Return pairs (2, n) of cells whose nodes the tangent may couple; collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, dim) of this rank's points to the vector b; collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _nodal_values(self, function: fem.Function) -> Array:
         """Return the values (nodes, dim) at the nodes of all cells; collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _may_touch(self, cell: Longs, other: Longs) -> Flags:
         """Return flags (n,): whether cells (n,) may touch others, which are not their material."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _mean_thickness(self, places: Places) -> Array:
         """Return the mean (n,) of the undeformed thicknesses over R at points and places."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _are_edges_alone(self, nearest: Places) -> Flags:
         """Return flags (n,): points on an edge that presses on a face whose own do not count."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _places_within_reach(self) -> Places:
         """Return the places that points face within the reach; at least the nearest of each."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _projections_of_midsurfaces(self, u: Array, reach: float) -> Places:
         """Return the places nearer than a distance between mid-surfaces at u; collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def least_gap(self) -> float:
         """Return the least gap over R; nan where no faces are within the reach. Collective."""
-        raise NotImplementedError
 
+    @abstractmethod
     def deepest_penetration(self) -> tuple[float, Array]:
         """Return the largest penetration, and the point (3,) where it is, both over R; collective.
 
         Without contact they are 0 and the origin.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def weight_slopes(self, tables: Array, places: Array) -> Array:
         """Return relative derivatives (n, functions, dim) of points' weights by undeformed nodes.
 
@@ -728,4 +730,3 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
             Shape functions (n, functions) at points and the undeformed points (n, dim), each with
             its derivatives by the coordinates of the cell.
         """
-        raise NotImplementedError

@@ -583,8 +583,7 @@ class SurfaceContact(PairContact[Projections]):
     def weight_slopes(self, tables: Array, places: Array) -> Array:
         """Return relative derivatives (n, functions, 3) of points' weights by undeformed nodes.
 
-        A weight is proportional to the
-        undeformed area J0 = |a_1 x a_2|.
+        A weight is proportional to the undeformed area J0 = |a_1 x a_2|.
 
         Parameters
         ----------

@@ -66,13 +66,13 @@ class Usage:
 
     Attributes
     ----------
-    request
+    asked
         The request: text and settings of the case, and the sources.
     cpu_s, wall_s
         Times of the process.
     """
 
-    request: dict[str, Any]
+    asked: dict[str, Any]
     cpu_s: float
     wall_s: float
 
@@ -156,13 +156,13 @@ def _stored_results(
     reason
         Why the run of this case is computed again; "" if it serves, or if there is none.
     """
-    if usage and usage.request == request:
+    if usage and usage.asked == request:
         try:
             return (read_summary(folder), read_lines(folder / "path.csv")), ""
         except (OSError, Damaged) as e:
             return None, str(e)
     # the same but for the sources
-    if usage and usage.request | {"sources": request["sources"]} == request:
+    if usage and usage.asked | {"sources": request["sources"]} == request:
         return None, "the folder has results of other sources of magshell_fenicsx"
     return None, ""
 

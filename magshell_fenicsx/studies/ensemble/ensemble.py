@@ -156,6 +156,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
         access_disk(comm, lambda: _copy(samples_by_key, part_stores, store))
+        _say_at_begin(len(samples_by_key), 0, comm, say)
     else:
         _compute_missing(samples_by_key, scalar, store, comm, say)
     rows = [_row(sample_variants, store, scalar) for sample_variants in zip(*variants, strict=True)]
@@ -190,10 +191,7 @@ def _compute_missing(
         comm,
         lambda outcome: outcome.serves(scalar) and not outcome.is_error,
     )
-    ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
-    say_on_first_rank(say, comm)(
-        f"{len(samples_by_key)} samples, {len(missing)} to compute on {ranks}"
-    )
+    _say_at_begin(len(samples_by_key), len(missing), comm, say)
     folds = KnownFolds()
     compute_points(
         missing,
@@ -203,6 +201,12 @@ def _compute_missing(
         say,
         words=lambda outcome: _words(outcome, scalar),
     )
+
+
+def _say_at_begin(count: int, missing_count: int, comm: MPI.Intracomm, say: Say) -> None:
+    """Say on rank 0 how many samples there are, and how many of them will be computed."""
+    ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
+    say_on_first_rank(say, comm)(f"{count} samples, {missing_count} to compute on {ranks}")
 
 
 def _words(outcome: Outcome, scalar: Scalar) -> str:
