@@ -162,7 +162,7 @@ def _texts(data: Any) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class MemberCase:
-    """One of the shells of a case, with a case of its own.
+    """A shell of several in a case, with a case of its own.
 
     Attributes
     ----------

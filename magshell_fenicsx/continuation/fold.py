@@ -446,12 +446,16 @@ def fold_by_one_step(
         raise FoldLost("the tangent is singular in more than one direction") from None
     if not max_abs(system.comm, du) <= MAX_STEP * system.length:
         raise FoldLost("Newton's method diverged on its way to a fold")
-    found = state.with_(state.u + du, name, state.mu[name] + dmu)
-    v = tangent.null_vector_at(state, found)
-    load = system.load(found.u, found.mu, name)
-    residual_along_v = dot(system.comm, v, system.residual(found.u, found.mu))
+    fold_state = state.with_(state.u + du, name, state.mu[name] + dmu)
+    v = tangent.null_vector_at(state, fold_state)
+    load = system.load(fold_state.u, fold_state.mu, name)
+    residual_along_v = dot(system.comm, v, system.residual(fold_state.u, fold_state.mu))
     correction = -residual_along_v / dot(system.comm, v, load)
-    return found.with_(found.u, name, found.mu[name] + correction), v, tangent.unstable
+    return (
+        fold_state.with_(fold_state.u, name, fold_state.mu[name] + correction),
+        v,
+        tangent.unstable,
+    )
 
 
 def residual_multiplier(system: System, fold: Fold) -> Vector:

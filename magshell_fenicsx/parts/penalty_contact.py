@@ -23,7 +23,7 @@ PASS_THROUGH_DISTANCE = 0.5  # thicknesses: faces that overlap by more pass thro
 
 
 class PenaltyOptions(Protocol):
-    """What a problem says of a contact's penalty.
+    """Settings of a contact's penalty in a problem.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class PenaltyContact(ABC, Generic[Configuration, Frozen]):
     @property
     @abstractmethod
     def options(self) -> PenaltyOptions:
-        """What the problem says of the penalty."""
+        """Settings of the penalty in the problem."""
 
     @property
     @abstractmethod

@@ -231,9 +231,9 @@ def number_with_error(value: float, error: float | None, digits: int = 9) -> str
     >>> number_with_error(0.3, 2.0), number_with_error(-0.0996, 0.0095, 6)
     ('0(2)', '-0.10(1)')
     """
-    plain = f"{value:.{digits}g}"
+    number_text = f"{value:.{digits}g}"
     if error is None or not 0 < error < inf or not isfinite(value):
-        return plain
+        return number_text
     # the error is `count` units of the decimal place `place`
     place = floor(log10(error))
     count = ceil(round(error / 10.0**place, 6))
@@ -241,7 +241,7 @@ def number_with_error(value: float, error: float | None, digits: int = 9) -> str
         count, place = 1, place + 1
     exponent = floor(log10(abs(value))) if value else place
     if place <= exponent - digits:
-        return plain
+        return number_text
     # a number that would begin with many zeros, or end with them, has a power of ten
     power = 0 if -5 < exponent < digits else exponent
     decimals = max(power - place, 0)

@@ -347,8 +347,8 @@ def is_column_of_numbers(name: str) -> bool:
     >>> [is_column_of_numbers(name) for name in ("rim_mx", "rim_mx_N_m", "rim", "label")]
     [True, True, False, False]
     """
-    if found := told_quantity(name):
-        return found.kind != "text"
+    if told := told_quantity(name):
+        return told.kind != "text"
     if any(name == column.name for q in QUANTITIES.values() for column in q.in_units):
         return True
     # one that is not registered, in a unit: its name lost an "over_h" and has the unit's ending
@@ -357,8 +357,8 @@ def is_column_of_numbers(name: str) -> bool:
         places = range(1, len(words) + 1)
         over_h = ("_".join([*words[:i], "over_h", *words[i:]]) for i in places)
         for dimensionless in ("_".join(words), *over_h):
-            found = told_quantity(dimensionless)
-            if found and any(name == column.name for column in found.in_units):
+            candidate = told_quantity(dimensionless)
+            if candidate and any(name == column.name for column in candidate.in_units):
                 return True
     return False
 

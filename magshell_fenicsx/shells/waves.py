@@ -165,7 +165,7 @@ class Waves:
 
     @property
     def tangents(self) -> "Waves | None":
-        """These waves, which give tangents to a `StabilityMonitor`; None with nonlocal terms.
+        """The waves, which give tangents to a `StabilityMonitor`; None with nonlocal terms.
 
         The entries of these have no sparsity pattern in common, and are no polynomials in m.
         """

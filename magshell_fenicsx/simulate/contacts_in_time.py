@@ -90,8 +90,8 @@ class ContactsInTime:
             Position within the step, from 0 to 1, at which the system takes its forces.
         """
         ends = zip(self._at_begin(begin), self._configurations(end), strict=True)
-        for contact, (before, after) in zip(self._contacts, ends, strict=True):
-            contact.average(before, after, part)
+        for contact, (begin_state, end_state) in zip(self._contacts, ends, strict=True):
+            contact.average(begin_state, end_state, part)
 
     def use_state_forces(self) -> None:
         """Let contact forces be those of the present state again."""
@@ -103,8 +103,10 @@ class ContactsInTime:
         ends = [*zip(self._at_begin(begin), self._configurations(end), strict=True)]
         # contacts between shells come last
         ends_of_shells = ends[len(ends) - len(self._shell_contacts) :]
-        for contact, (before, after) in zip(self._shell_contacts, ends_of_shells, strict=True):
-            if contact.passes_through(before, after):
+        for contact, (begin_state, end_state) in zip(
+            self._shell_contacts, ends_of_shells, strict=True
+        ):
+            if contact.passes_through(begin_state, end_state):
                 return f"{contact.pair.words} pass through each other"
         return ""
 

@@ -174,7 +174,7 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
     _refuse(scene, record)
     if scene.model.contacts or scene.model.shell_contacts:
         raise NotEstimated("frequencies depend on the stiffness of contacts")
-    comparison = Comparison(scene, fine_scene(scene), record)
+    comparison = DegreeComparison(scene, fine_scene(scene), record)
     space = mode_space(comparison.fine.model)
     fine_modes = ShellModes(space.model).vibrations(
         space.state(comparison.state),
@@ -183,7 +183,7 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
     )
     errors, ranks = dict[str, float](), Counter[str]()
     for number, mode in enumerate(modes, 1):
-        of_label = [each.eigenvalue for each in fine_modes if each.label == mode.label]
+        of_label = [other.eigenvalue for other in fine_modes if other.label == mode.label]
         if mode.eigenvalue and ranks[mode.label] < len(of_label):  # zero of a rigid motion is exact
             change = of_label[ranks[mode.label]] - mode.eigenvalue
             errors[f"omega2_{number}"] = _estimated(change)
@@ -199,12 +199,14 @@ def _estimated(change: float, load_error: float = 0.0) -> float:
 def _instabilities(scene: Scene, history: History) -> list[tuple[Record, dict[str, str]]]:
     """Return the instabilities that are results, each with name of the result -> its column."""
     columns_of = dict[int, dict[str, str]]()
-    held = {step.number for step in scene.problem.programme if step.name in step.load.hold}
+    steps_with_held_conjugate = {
+        step.number for step in scene.problem.programme if step.name in step.load.hold
+    }
     # name of a result -> the load that has it; "" for any load
     load_of_result = {a.critical_names[0]: a.name for a in AMPLITUDES.values() if a.critical_names}
     for name, mu in {**load_of_result, "limit_load": ""}.items():
         for number, record in enumerate(history.located):
-            at_held_volume = name == "knockdown" and record.step in held
+            at_held_volume = name == "knockdown" and record.step in steps_with_held_conjugate
             if mu in ("", record.amplitude) and not at_held_volume:
                 column = amplitude(record.amplitude).column
                 columns_of.setdefault(number, {})[name] = column
@@ -217,9 +219,9 @@ class _FineScenes:
 
     def __init__(self) -> None:
         self._scenes = dict[int, Scene]()
-        self._comparisons = dict[int, Comparison]()
+        self._comparisons = dict[int, DegreeComparison]()
 
-    def comparison(self, first_scene: Scene, record: Record) -> "Comparison":
+    def comparison(self, first_scene: Scene, record: Record) -> "DegreeComparison":
         """Return the comparison at a record; collective.
 
         Raises
@@ -232,7 +234,7 @@ class _FineScenes:
             _refuse(scene, record)
             if id(scene) not in self._scenes:
                 self._scenes[id(scene)] = fine_scene(scene)
-            self._comparisons[id(record)] = Comparison(scene, self._scenes[id(scene)], record)
+            self._comparisons[id(record)] = DegreeComparison(scene, self._scenes[id(scene)], record)
         return self._comparisons[id(record)]
 
 
@@ -273,11 +275,13 @@ def fine_scene(scene: Scene) -> Scene:
     fine_problem = replace(problem, mesh=mesh, unknowns=unknowns)
     if warning := beyond_memory(fine_problem, scene.comm):
         raise NotEstimated(warning)
-    fine = Scene(fine_problem, scene.comm)
-    cells, fine_cells = (s.model.V.mesh.topology.original_cell_index for s in (scene, fine))
+    fine_scene_of_run = Scene(fine_problem, scene.comm)
+    cells, fine_cells = (
+        s.model.V.mesh.topology.original_cell_index for s in (scene, fine_scene_of_run)
+    )
     if not scene.comm.allreduce(np.array_equal(cells, fine_cells), MPI.LAND):
         raise NotEstimated("the cells of the mesh are in another order")
-    return fine
+    return fine_scene_of_run
 
 
 def with_higher_degree(source: Scene, target: Scene, u: Vector) -> Vector:
@@ -290,13 +294,15 @@ def with_higher_degree(source: Scene, target: Scene, u: Vector) -> Vector:
     nodes = W.element.basix_element.points
     table = V.element.basix_element.tabulate(0, nodes)[0, :, :, 0]
     values = source.model.system.with_ghosts(u).reshape(-1, V.dofmap.bs)[V.dofmap.list]
-    raised = np.zeros((W.dofmap.index_map.size_local + W.dofmap.index_map.num_ghosts, W.dofmap.bs))
-    raised[W.dofmap.list] = np.einsum("qp,npc->nqc", table, values)
-    return target.model.system.zero_at_supports(raised.ravel()[: target.model.system.size])
+    fine_values = np.zeros(
+        (W.dofmap.index_map.size_local + W.dofmap.index_map.num_ghosts, W.dofmap.bs)
+    )
+    fine_values[W.dofmap.list] = np.einsum("qp,npc->nqc", table, values)
+    return target.model.system.zero_at_supports(fine_values.ravel()[: target.model.system.size])
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DegreeComparison:
     """A point of a run, and the same point with one degree more.
 
     Attributes
@@ -322,16 +328,17 @@ class Comparison:
         NotEstimated, FoldLost, NoEigenpair, LinAlgError
             If the point is not found with one degree more.
         """
-        before = self.scene.observe(self.record.point.state)
-        after = self.fine.observe(self.state)
+        row = self.scene.observe(self.record.point.state)
+        fine_row = self.fine.observe(self.state)
         changes = {
-            column: after[column] - value
-            for column, value in before.items()
-            if isfinite(value + after[column]) and max(abs(value), abs(after[column])) > ROUNDING
+            column: fine_row[column] - value
+            for column, value in row.items()
+            if isfinite(value + fine_row[column])
+            and max(abs(value), abs(fine_row[column])) > ROUNDING
         }
         return changes | self.scene.sizes.values(changes)
 
-    def barrier_from(self, begin: "Comparison") -> float:
+    def barrier_from(self, begin: "DegreeComparison") -> float:
         """Return the change of the barrier of the last step, by one degree more; collective.
 
         Parameters
@@ -341,8 +348,8 @@ class Comparison:
         """
         step = self.scene.problem.programme[self.record.step - 1]
         states = begin.record.point.state, self.record.point.state
-        before = barrier(self.scene, step, *states)
-        return barrier(self.fine, step, begin.state, self.state) - before
+        barrier_of_run = barrier(self.scene, step, *states)
+        return barrier(self.fine, step, begin.state, self.state) - barrier_of_run
 
     @cached_property
     def state(self) -> State:
@@ -361,13 +368,13 @@ class Comparison:
 
         What the step holds has the value of the record.
         """
-        fine, record = self.fine, self.record
-        u = with_higher_degree(self.scene, fine, record.point.state.u)
+        fine_scene, record = self.fine, self.record
+        u = with_higher_degree(self.scene, fine_scene, record.point.state.u)
         # cuts belong to the mesh and the degree
-        guess = with_cuts_here(fine, State(u, dict(record.point.state.mu)))
-        stage = load_stage(fine)
+        guess = with_cuts_here(fine_scene, State(u, dict(record.point.state.mu)))
+        stage = load_stage(fine_scene)
         if record.step:
-            stage = stage_of_step(fine, fine.problem.programme[record.step - 1], guess)
+            stage = stage_of_step(fine_scene, fine_scene.problem.programme[record.step - 1], guess)
         return stage, stage.enter(guess)
 
     def _equilibrium(self) -> tuple[Stage, State, ConstraintRow]:
@@ -453,14 +460,14 @@ class Comparison:
         eigenvalue, v = nearest_to_zero(factors)
         self._refuse_later(factors.negative_pivots - (eigenvalue < 0), self.record.excluded_pivots)
 
-        def moved(dmu: float) -> State:
+        def state_further_along(dmu: float) -> State:
             """Return the state of the model further along the path."""
             return stage.leave(state.with_(state.u + dmu * response.du, name, mu + dmu))
 
         step = SLOPE_STEP * (abs(mu) or 1.0)
-        product = _tangent_times(family, moved(step), v)
+        product = _tangent_times(family, state_further_along(step), v)
         slope = (dot(self.fine.comm, v, product) - eigenvalue) / step
-        return moved(_load_change(-eigenvalue, slope, mu))
+        return state_further_along(_load_change(-eigenvalue, slope, mu))
 
     def _refuse_later(self, unstable: int, unstable_before: int) -> None:
         """Check that no other modes are unstable at an instability with one degree more.
@@ -495,8 +502,8 @@ def _load_change(eigenvalue_change: float, slope: float, load: float) -> float:
     TooCoarse
         If the change is large, or the eigenvalue does not depend on the load.
     """
-    bound = MAX_LOAD_CHANGE * (abs(load) or 1.0)
-    if not abs(eigenvalue_change) < bound * abs(slope):
+    largest_change = MAX_LOAD_CHANGE * (abs(load) or 1.0)
+    if not abs(eigenvalue_change) < largest_change * abs(slope):
         raise TooCoarse("with one degree more no mode is neutral nearby")
     return eigenvalue_change / slope
 
@@ -525,7 +532,7 @@ def _family(scene: Scene, label: str) -> ModeFamily:
     """
     modes = scene.model.symmetry_breaking_modes
     families = modes.families if modes else ()
-    family = next((each for each in families if each.label == label), None)
+    family = next((item for item in families if item.label == label), None)
     if family is None:
         raise NotEstimated(f"the model has no tangent of its modes {label}")
     return family

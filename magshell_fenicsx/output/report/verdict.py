@@ -542,11 +542,14 @@ def _errors_of_load(line: Line, summary: Summary) -> dict[str, float]:
     It is empty without an estimate. `line` is the row of the instability.
     """
     name = amplitude(line["amplitude"]).column
-    error, shown = summary.get("errors", {}).get("limit_load"), shown_quantity(name, line).name
+    error, shown_column = (
+        summary.get("errors", {}).get("limit_load"),
+        shown_quantity(name, line).name,
+    )
     if error is None:
         return {}
-    ratio = float(line[shown]) / float(line[name]) if float(line[name]) else 0.0
-    return {shown: abs(ratio) * error, name: error}
+    ratio = float(line[shown_column]) / float(line[name]) if float(line[name]) else 0.0
+    return {shown_column: abs(ratio) * error, name: error}
 
 
 def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:

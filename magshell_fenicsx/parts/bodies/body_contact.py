@@ -367,7 +367,7 @@ def _outer_square(a: Array) -> Array:
 
 @dataclass(frozen=True)
 class PointConfiguration:
-    """Where the points of a shell are relative to a body; lengths are over R.
+    """Positions of the points of a shell relative to a body; lengths are over R.
 
     Attributes
     ----------

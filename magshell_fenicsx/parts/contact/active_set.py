@@ -82,8 +82,8 @@ class ActiveSet(Generic[Places]):
         slopes = distance_slopes(n, beta, rates.shape[1])
         closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
         # the distance of a joined place changes by the weighted mean of its places' changes
-        joined = self.joined_places
-        return np.bincount(joined.group, joined.weight * closing, len(joined.first)).astype(float)
+        groups = self.joined_places
+        return np.bincount(groups.group, groups.weight * closing, len(groups.first)).astype(float)
 
 
 @dataclass(frozen=True)

@@ -442,12 +442,12 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         return float(self._comm.allreduce(own_largest, MPI.MAX))
 
     def penetration_message(self, stiffness: float, *, moving: bool) -> str:
-        depth, bound = self.relative_penetration(), self.pair.max_penetration
-        bound *= IMPACT_BOUND_RATIO if moving else 1.0
-        if depth <= bound:
+        depth, limit = self.relative_penetration(), self.pair.max_penetration
+        limit *= IMPACT_BOUND_RATIO if moving else 1.0
+        if depth <= limit:
             return ""
         finding = (
-            f"the penetration between {self.pair.words} is {depth:.3g} h, more than {bound:g} h"
+            f"the penetration between {self.pair.words} is {depth:.3g} h, more than {limit:g} h"
         )
         if moving or self.pair.has_given_stiffness:
             return f"{finding}; contact: stiffness: is {stiffness:.4g}: give four times as much"

@@ -140,16 +140,20 @@ def boundary(
     # the case of another run takes the place of the file, and so of its settings
     for setting in settings if start else ():
         override(source, setting)
-    varied, folder, name = VariedCase(source, span, make_case), user_folder(out), Path(file).name
+    varied_case, folder, name = (
+        VariedCase(source, span, make_case),
+        user_folder(out),
+        Path(file).name,
+    )
     say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
     with (
         FOLDER.locked(folder, comm, name),
         reporting_progress(comm, say_on_first_rank) as say_on_first_rank,
     ):
         say = say_on_first_rank if comm.rank == 0 else say
-        journal = partial(Journal, folder / "points", varied.identity(begun_at.text))
-        value = varied.start_value(may_be_outside=not start)
-        begin = _begin(varied, value, begun_at, journal, comm, say_on_first_rank)
+        journal = partial(Journal, folder / "points", varied_case.identity(begun_at.text))
+        value = varied_case.start_value(may_be_outside=not start)
+        begin = _begin(varied_case, value, begun_at, journal, comm, say_on_first_rank)
         say_on_first_rank(
             f"{span.key} = {span.text(value)}: {begin['label']} at "
             f"{load_text(begin['row'], begin['amplitude'])}"
@@ -165,7 +169,7 @@ def boundary(
             """
             part_journal = journal("down" if sense < 0 else "up")
             if not part_journal.outcome:
-                part_journal.finish(_followed(varied, value, sense, begin, part_journal, say))
+                part_journal.finish(_followed(varied_case, value, sense, begin, part_journal, say))
             rows = part_journal.outcome["rows"]
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
@@ -182,7 +186,7 @@ def boundary(
 
 
 def _begin(
-    varied: VariedCase,
+    varied_case: VariedCase,
     value: float,
     start: Start,
     journal: Callable[[str], Journal],
@@ -192,7 +196,7 @@ def _begin(
     """Return the instability at which the boundary starts, as plain data; collective.
 
     A half cannot follow a mode that it excludes. The whole shell, of which such a mode is its own,
-    then takes its place in `varied`.
+    then takes its place in `varied_case`.
 
     Parameters
     ----------
@@ -219,14 +223,14 @@ def _begin(
     def instability(part: str, start: Start) -> dict[str, Any]:
         """Return the instability in a history, of which the part keeps the journal."""
         return access_disk(
-            comm, lambda: _run_to_instability(varied, value, journal(part), say, start)
+            comm, lambda: _run_to_instability(varied_case, value, journal(part), say, start)
         )
 
     begin = instability("start", start)
     name_of_mode = begin["mode"]
     if name_of_mode == ANTISYMMETRIC:
         say("the instability is antisymmetric: the whole shell is modelled")
-        override(varied.source, "symmetry=none")
+        override(varied_case.source, "symmetry=none")
         # the points of the whole shell's history have other numbers
         begin = instability("whole", start.anywhere())
     if not begin["label"]:
@@ -237,7 +241,7 @@ def _begin(
 
 
 def _run_to_instability(
-    varied: VariedCase,
+    varied_case: VariedCase,
     value: float,
     journal: Journal,
     say: Say,
@@ -268,11 +272,11 @@ def _run_to_instability(
     Stopped
         If the path is lost before the instability.
     """
-    for end in varied.span.ends:  # raises errors before anything is computed
-        varied.problem(end)
+    for end in varied_case.span.ends:  # raises errors before anything is computed
+        varied_case.problem(end)
     if journal.outcome:
         return journal.outcome
-    scene = Scene(varied.problem(value), MPI.COMM_SELF)
+    scene = Scene(varied_case.problem(value), MPI.COMM_SELF)
     records, lost_reason = _records_to_start(scene, start, say)
     try:
         instability = start.instability_in(records)
@@ -322,7 +326,7 @@ def _records_to_start(scene: Scene, start: Start, say: Say) -> tuple[list[Record
 
 
 def _followed(
-    varied: VariedCase,
+    varied_case: VariedCase,
     value: float,
     sense: int,
     begin: dict[str, Any],
@@ -354,7 +358,7 @@ def _followed(
     Stopped
         If not even the start is found.
     """
-    span, family = varied.span, _scene_family(varied, value, begin)
+    span, family = varied_case.span, _scene_family(varied_case, value, begin)
     # changes of load and key that count as of order one in the arc length of the boundary
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     rows: list[dict[str, Any]] = []
@@ -401,7 +405,7 @@ def _followed(
     return {"rows": rows, "stopped": "", "alone": family.has_one_scene}
 
 
-def _scene_family(varied: VariedCase, value: float, begin: dict[str, Any]) -> SceneFamily:
+def _scene_family(varied_case: VariedCase, value: float, begin: dict[str, Any]) -> SceneFamily:
     """Return the scenes of the case for all values of the key, about the instability at the start.
 
     Parameters
@@ -416,7 +420,7 @@ def _scene_family(varied: VariedCase, value: float, begin: dict[str, Any]) -> Sc
     CaseError
         If the key has no influence, or the instability cannot be followed.
     """
-    span, scene = varied.span, Scene(varied.problem(value), MPI.COMM_SELF)
+    span, scene = varied_case.span, Scene(varied_case.problem(value), MPI.COMM_SELF)
     u = vector_of(begin["u"])
     # only the state of the point is known, and needed
     point = Point(
@@ -424,7 +428,7 @@ def _scene_family(varied: VariedCase, value: float, begin: dict[str, Any]) -> Sc
     )
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
-        return SceneFamily(scene, record, varied.problem, value, value_range=span.ends)
+        return SceneFamily(scene, record, varied_case.problem, value, value_range=span.ends)
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
 

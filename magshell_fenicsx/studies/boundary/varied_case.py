@@ -74,7 +74,7 @@ def parse_range(text: str) -> VariedKey:
             raise ValueError
         # the unit of the first bound that has one counts for both
         unit = number_and_unit(bounds_and_steps[0])[1] or number_and_unit(bounds_and_steps[1])[1]
-        first, last = (in_unit(bound, unit) for bound in bounds_and_steps[:2])
+        first, last = (in_unit(text_of_bound, unit) for text_of_bound in bounds_and_steps[:2])
         steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else DEFAULT_STEPS
     except ValueError:
         raise CaseError(f"--over {text}: {FORM_HINT}") from None

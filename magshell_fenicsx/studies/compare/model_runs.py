@@ -61,7 +61,7 @@ class NothingLeft(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Usage:
+class StoredUsage:
     """The content of usage.json of a run.
 
     Attributes
@@ -118,7 +118,7 @@ def run_model(
         "settings": model_settings,
         "sources": code_version(),
     }
-    usage = stored_outcome(folder / "usage.json", TypeAdapter(Usage))
+    usage = stored_outcome(folder / "usage.json", TypeAdapter(StoredUsage))
     results, reason = _stored_results(folder, usage, request)
     if reason:
         say(f"{model} at refinement {refinement:g}: computed again, {reason}")
@@ -138,7 +138,7 @@ Results = tuple[dict[str, Any], list[dict[str, str]]]
 
 
 def _stored_results(
-    folder: Path, usage: Usage | None, request: Mapping[str, Any]
+    folder: Path, usage: StoredUsage | None, request: Mapping[str, Any]
 ) -> tuple[Results | None, str]:
     """Return the results of the run in a folder, and why they do not serve.
 
@@ -184,7 +184,7 @@ def _refuse_another_case(folder: Path, case: Path) -> None:
 
 def _run_in_process(
     case: Path, model: ModelName, folder: Path, request: Mapping[str, Any]
-) -> tuple[Usage, Results]:
+) -> tuple[StoredUsage, Results]:
     """Run a case in a process of its own into a folder, and write its usage.json.
 
     Parameters
@@ -213,7 +213,7 @@ def _run_in_process(
         raise NothingLeft(f"model: {model}: {measured.last_error or f'exit code {measured.code}'}")
     summary, rows = read_summary(folder), read_lines(folder / "path.csv")
     # the sources that the run has recorded itself
-    usage = Usage({**request, "sources": summary["sources"]}, measured.cpu_s, measured.wall_s)
+    usage = StoredUsage({**request, "sources": summary["sources"]}, measured.cpu_s, measured.wall_s)
     keep(folder / "usage.json", asdict(usage))
     return usage, (summary, rows)
 
