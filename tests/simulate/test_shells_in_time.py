@@ -94,7 +94,7 @@ def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
     def force(end: Array, part: float) -> Array:
         contact.samples = ()
         contact.samples = samples_of_step(contact, begin, end, part)
-        return np.sum(at_each_sample(contact, contact._forces), axis=0)[:, : r.shape[1]]
+        return np.sum(at_each_sample(contact, contact._gradient), axis=0)[:, : r.shape[1]]
 
     def energy(u: Array) -> float:
         contact.samples, contact.sample = (), StepSample(u)
