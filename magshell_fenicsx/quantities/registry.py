@@ -347,8 +347,8 @@ def is_column_of_numbers(name: str) -> bool:
     >>> [is_column_of_numbers(name) for name in ("rim_mx", "rim_mx_N_m", "rim", "label")]
     [True, True, False, False]
     """
-    if told := told_quantity(name):
-        return told.kind != "text"
+    if known_quantity := told_quantity(name):
+        return known_quantity.kind != "text"
     if any(name == column.name for q in QUANTITIES.values() for column in q.in_units):
         return True
     # one that is not registered, in a unit: its name lost an "over_h" and has the unit's ending

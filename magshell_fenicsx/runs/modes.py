@@ -46,6 +46,7 @@ from magshell_fenicsx.simulate.contact_control import (
     touching_bodies,
     with_stiffer_bodies,
 )
+from magshell_fenicsx.simulate.discretisation_error import frequency_errors
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
@@ -430,8 +431,6 @@ def add_frequency_errors(
     time_unit
         Unit of time (s), for hertz; None without.
     """
-    from magshell_fenicsx.simulate.discretisation_error import frequency_errors
-
     if result.last_record is None or result.stopped:
         return
     estimates, errors = result.error_estimates, dict[str, float]()

@@ -32,12 +32,12 @@ from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
+from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates, estimate_errors
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 if TYPE_CHECKING:
     from magshell_fenicsx.simulate.adapt.choice import Adapted
-    from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates
 
 Array = NDArray[np.float64]
 
@@ -210,14 +210,11 @@ class Result:
     scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
 
     @cached_property
-    def error_estimates(self) -> "ErrorEstimates":
+    def error_estimates(self) -> ErrorEstimates:
         """Estimated errors of the results, and why others have none.
 
         The first access is collective, and solves with one degree more on the same mesh.
         """
-        # a run whose errors nobody asks for does without
-        from magshell_fenicsx.simulate.discretisation_error import estimate_errors
-
         has_stopped = bool(self.stopped)
         estimates = estimate_errors(self.scene, self.path_history, has_stopped=has_stopped)
         errors, with_units = estimates.errors, in_units(self)
@@ -374,7 +371,7 @@ class Result:
             return None
 
 
-def summary(result: Result, estimates: "ErrorEstimates", total_s: float) -> dict[str, Any]:
+def summary(result: Result, estimates: ErrorEstimates, total_s: float) -> dict[str, Any]:
     """Return the content of summary.json of a run; collective.
 
     Parameters

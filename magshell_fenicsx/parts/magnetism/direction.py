@@ -122,7 +122,7 @@ def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: flo
         sine = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
         return degrees(atan2(sine, float(first @ direction)))
     # else: components along the first direction, and across it
-    along, second, third = (mu.get(name, 0.0) for name in COMPONENTS)
+    component, second, third = (mu.get(name, 0.0) for name in COMPONENTS)
     if not (second or third):
         return 0.0
-    return degrees(atan2(hypot(second, third) if third else sense * second, sense * along))
+    return degrees(atan2(hypot(second, third) if third else sense * second, sense * component))
