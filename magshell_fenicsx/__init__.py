@@ -98,6 +98,7 @@ _NAMES_OF_MODULES = {
     "models.shell": "kinematics",
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",
+    "model": "Mode Model",
     "public": "Scene boundary follow identify run",
     "python": "Clamped Field Force Held Hinged OnPlane Pressure Problem Section Shell Step",
     "runs.notebook": "curve off_screen picture polydata surface",

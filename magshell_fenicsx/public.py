@@ -4,17 +4,17 @@ That is a case, a mapping like a case file, or the path of a file. A problem has
 computed; a scene is a problem with its finite element model. The processes are those of MPI.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING
 from warnings import warn
 
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.case_variants import open_case, with_same_files
-from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.case.open_problem import ProblemSource, problem_of, processes
+from magshell_fenicsx.model import Model
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.runs.modes import frequencies_after
@@ -29,48 +29,11 @@ if TYPE_CHECKING:
     from magshell_fenicsx.studies.boundary.stability_boundary import StabilityBoundary
     from magshell_fenicsx.studies.identify.identification import Identified
 
-ProblemSource: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
 
 
-def problem_of(
-    source: ProblemSource, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()
-) -> Problem:
-    """Return the problem itself, or that of a case, a mapping or the file at a path; collective.
-
-    Parameters
-    ----------
-    terms
-        User-defined energies besides those of the case, with their amplitudes at `OwnTerm.value`.
-
-    Raises
-    ------
-    CaseError, MeshError
-        If it is none of these, or no problem can be made of it.
-    """
-    if isinstance(source, Problem):
-        if terms:
-            raise CaseError(
-                "terms: a problem has its energies already: give them to what makes the problem"
-            )
-        return source
-    case = open_case(source, comm)
-    try:
-        return (case.with_terms([*case.own_terms, *terms]) if terms else case).problem()
-    except (CaseError, MeshError) as e:
-        raise type(e)(case.with_place(str(e))) from None
-
-
-def processes(source: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
-    """Return the processes of a run: by default those of a problem's mesh, or all."""
-    mesh_file = source.mesh_file if isinstance(source, Problem) else None
-    if comm:
-        return comm
-    return mesh_file.user_mesh.comm if mesh_file and mesh_file.user_mesh else MPI.COMM_WORLD
-
-
-class Scene(SceneOfProblem):
-    """A problem ready to be solved.
+class Scene(Model):
+    """The former name of `Model`.
 
     Parameters
     ----------
@@ -94,17 +57,16 @@ class Scene(SceneOfProblem):
     ) -> None:
         if plan is not None:
             warn(
-                "Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2
+                "Scene(case, plan=problem) is now Model(problem)", DeprecationWarning, stacklevel=2
             )
-        comm = processes(plan or case, comm)
-        super().__init__(plan or problem_of(case, comm, terms), comm)
+        super().__init__(plan or case, comm, terms=terms)
         self._given = case
 
     @property
     def case(self) -> Case:
         """The case that the scene was made of, as in earlier versions."""
         warn(
-            "Scene.case is now Scene.problem, which has all that is computed",
+            "Scene.case is now Model.problem, which has all that is computed",
             DeprecationWarning,
             stacklevel=2,
         )
@@ -131,7 +93,7 @@ def follow(
         Called with sentences without which the result must not be read; by default they are
         warnings.
     """
-    scene = given if isinstance(given, SceneOfProblem) else Scene(given)
+    scene = given if isinstance(given, SceneOfProblem) else Model(given)
     return follow_scene(scene, search=search, remark=remark)
 
 

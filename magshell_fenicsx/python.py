@@ -183,14 +183,14 @@ class Shell:
     def plain_value(self, value: Any, key: str) -> Any:
         """Return a value as a case file has it: plain lists, mappings, numbers and text.
 
-        A function on the mesh becomes a `UserField`.
+        A function or a constant on the mesh becomes a `UserField`.
 
         Parameters
         ----------
         key
             Key of the value in the case, for messages.
         """
-        if isinstance(value, fem.Function):
+        if isinstance(value, fem.Function | fem.Constant):
             return self.user_field(value, key)
         if isinstance(value, np.ndarray | np.generic):
             return value.tolist()
@@ -200,8 +200,8 @@ class Shell:
             return [self.plain_value(item, key) for item in value]
         return value
 
-    def user_field(self, function: fem.Function, key: str) -> UserField:
-        """Return a function on the shell's dolfinx mesh as a field of a case.
+    def user_field(self, function: fem.Function | fem.Constant, key: str) -> UserField:
+        """Return a function or a constant on the shell's dolfinx mesh as a field of a case.
 
         Parameters
         ----------
@@ -653,9 +653,11 @@ def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
     A field has the function's values in all triangles of the mesh. An energy without functions is
     returned itself.
     """
+    functions = fem.Function | fem.Constant
+    if not any(isinstance(p, functions) for p in term.parameters):
+        return term
     parameters = tuple(
-        shell.user_field(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
+        shell.user_field(p, f"terms.{term.name}") if isinstance(p, functions) else p
         for p in term.parameters
     )
-    has_functions = term.varying
-    return replace(term, parameters=parameters) if has_functions else term
+    return replace(term, parameters=parameters)

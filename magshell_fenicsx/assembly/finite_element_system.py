@@ -195,6 +195,11 @@ class FiniteElementSystem:
         )
         self._fixed = fixed_dofs[fixed_dofs < self.size]
 
+    @property
+    def fixed_unknowns(self) -> NDArray[np.int32]:
+        """This rank's own unknowns that are zero or move with a support."""
+        return self._fixed
+
     def with_number(self, name: str, number: SettableNumber, value: float) -> "FiniteElementSystem":
         """Return the same system with one more number of its terms that a state may set.
 

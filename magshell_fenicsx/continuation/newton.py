@@ -263,6 +263,10 @@ class BorderedNewton:
         state = guess.with_(u, name, mu)
         return NewtonResult(state, converged, iterations, reason, callbacks.error)
 
+    def forget_factors(self) -> None:
+        """Forget to which state the factors belong: the energies have changed."""
+        self._tangent.forget()
+
     def ensure_factors_near(self, state: State, distance: float = np.inf) -> None:
         """Factor the tangent at a state unless factors of a near state are known. Collective.
 

@@ -136,6 +136,10 @@ class LatestTangent:
         """The latest factors."""
         return self._factorisation
 
+    def forget(self) -> None:
+        """Forget to which state the factors belong, as if another solver had made them."""
+        self._factored = None, 0
+
     def is_near(self, state: State, distance: float) -> bool:
         """Return whether the factored state is near another one, at any load. Collective.
 

@@ -66,7 +66,7 @@ class SurfaceTriangles:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UserField:
-    """A field on `SurfaceTriangles`, a polynomial in each; it is never changed.
+    """A field on `SurfaceTriangles`, a polynomial in each, with the values of a program's function.
 
     Attributes
     ----------
@@ -76,11 +76,13 @@ class UserField:
         Degree of the polynomials.
     nodal
         (m, nodes, size) values at the nodes of Basix's Lagrange element of the degree, in the order
-        of each triangle.
+        of each triangle; those of the function when it was read last.
     swapped
         (nodes,) number that each node has when the second and third vertex are exchanged.
     user_mesh
         The mesh that the field is on.
+    read
+        Returns the function's present values, as `nodal`; collective. None: they never change.
     """
 
     name: str
@@ -88,6 +90,7 @@ class UserField:
     nodal: Array
     swapped: NDArray[np.int64]
     user_mesh: "UserMesh | None" = None
+    read: Callable[[], Array] | None = None
 
     def __repr__(self) -> str:
         return "a function on the mesh"
@@ -95,7 +98,7 @@ class UserField:
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
 
-    @cached_property
+    @property
     def digest(self) -> str:
         """Hash of the values."""
         return _digest(self.nodal)
@@ -113,7 +116,20 @@ class UserField:
 
     def mapped(self, linear_map: Callable[[Array], Array]) -> "UserField":
         """Return the field after a linear map of its values (..., size) to (..., other size)."""
-        return replace(self, nodal=linear_map(self.nodal))
+        read = self.read
+        mapped_read = (lambda: linear_map(read())) if read else None
+        return replace(self, nodal=linear_map(self.nodal), read=mapped_read)
+
+    def update(self) -> None:
+        """Read the function again. Collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if values are not numbers.
+        """
+        if self.read:
+            self.nodal[...] = self.read()
 
     def in_cells(self, source_triangles: NDArray[np.int64]) -> Array:
         """Return the values (cells, nodes, size) in triangles of a triangulation, at their nodes.

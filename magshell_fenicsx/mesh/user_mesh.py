@@ -123,11 +123,15 @@ class UserMesh:
             self,
         )
 
-    def field(self, function: fem.Function, name: str) -> UserField:
+    def field(self, function: fem.Function | fem.Constant, name: str) -> UserField:
         """Return a function on this mesh as a field, a polynomial in each triangle; collective.
+
+        The field reads the function again in `UserField.update`.
 
         Parameters
         ----------
+        function
+            The function; a constant is a field of degree zero.
         name
             Name of the field in messages.
 
@@ -136,6 +140,8 @@ class UserMesh:
         MeshError
             If the function is on another mesh, or is no Lagrange or DG function.
         """
+        if isinstance(function, fem.Constant):
+            return self._constant_field(function, name)
         V = function.function_space
         if V.mesh._cpp_object is not self.mesh._cpp_object:
             raise MeshError(f"{name}: is a function on another mesh than that of the shell")
@@ -149,11 +155,41 @@ class UserMesh:
         nodes = lagrange_element(element.degree)
         # from nodal values of the function to those of the field, whose nodes are others
         table = element.tabulate(0, nodes.points)[0, :, :, 0]
-        values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
-        nodal = self._gather_cells(np.matmul(table, np.asarray(values, dtype=float)))
-        if not np.isfinite(nodal).all():
-            raise MeshError(f"{name}: has values that are not numbers")
-        return UserField(name, element.degree, nodal, swapped_nodes(nodes), self)
+
+        def read() -> Array:
+            """Return the function's values at the nodes of all triangles; collective."""
+            values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
+            nodal = self._gather_cells(np.matmul(table, np.asarray(values, dtype=float)))
+            return _finite(nodal, name)
+
+        return UserField(name, element.degree, read(), swapped_nodes(nodes), self, read)
+
+    def _constant_field(self, constant: fem.Constant, name: str) -> UserField:
+        """Return a number or a vector as a field of degree zero; collective.
+
+        Parameters
+        ----------
+        name
+            Name of the field in messages.
+
+        Raises
+        ------
+        MeshError
+            If it is a matrix, or on another mesh.
+        """
+        if constant.ufl_domain() != self.mesh.ufl_domain():
+            raise MeshError(f"{name}: is a constant on another mesh than that of the shell")
+        if len(constant.ufl_shape) > 1:
+            raise MeshError(f"{name}: is a matrix; allowed are numbers and vectors")
+        cell_count = self.mesh.topology.index_map(2).size_global
+
+        def read() -> Array:
+            """Return the constant in all triangles."""
+            value = np.atleast_1d(np.array(constant.value, dtype=float))
+            return _finite(np.tile(value, (cell_count, 1, 1)), name)
+
+        nodes = swapped_nodes(lagrange_element(0))
+        return UserField(name, 0, read(), nodes, self, read)
 
     def displacement(
         self, u: fem.Function, source_triangles: Numbers, scale: float
@@ -188,6 +224,31 @@ class UserMesh:
         displacement = fem.Function(W, name="u")
         displacement.x.array.reshape(-1, 3)[W.dofmap.list] = nodal_of_all[self._numbers]
         return displacement
+
+    def put_displacement(
+        self, u: fem.Function, into: fem.Function, source_triangles: Numbers, scale: float
+    ) -> None:
+        """Put a function on this mesh into a field of a scene, as `displacement` reversed.
+
+        Collective.
+
+        Parameters
+        ----------
+        u
+            A vector Lagrange function on this mesh, of the degree of the scene's field.
+        into
+            The vector Lagrange function on the scene's mesh.
+        source_triangles, scale
+            Those of `displacement`.
+        """
+        V, W = into.function_space, u.function_space
+        nodal_of_own = u.x.array.reshape(-1, 3)[W.dofmap.list[: self._owned]]
+        nodal_of_all = self._gather_cells(nodal_of_own) * scale
+        number, is_reversed = source_triangles.T
+        nodal = nodal_of_all[number]
+        swapped = nodal[:, swapped_nodes(V.element.basix_element)]
+        nodal = np.where(is_reversed[:, None, None] == 1, swapped, nodal)
+        into.x.array.reshape(-1, 3)[V.dofmap.list] = nodal
 
     def _original_numbers(self, cell_map: Any) -> Numbers:
         """Return the number of each local cell, ghosts included, in the order of their making.
@@ -323,6 +384,19 @@ class UserMesh:
         for numbers in self.comm.allgather(self._numbers[local_cells]):
             mask[numbers] = True
         return mask
+
+
+def _finite(values: Array, name: str) -> Array:
+    """Return values unchanged, if all are numbers.
+
+    Raises
+    ------
+    MeshError
+        If one is not; `name` begins the message.
+    """
+    if not np.isfinite(values).all():
+        raise MeshError(f"{name}: has values that are not numbers")
+    return values
 
 
 def lagrange_element(degree: int) -> basix.finite_element.FiniteElement:

@@ -12,7 +12,7 @@ that closes a moving one. A user field is a caller's function on the mesh. "Refu
 error on every rank.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem, SystemVariables
@@ -27,7 +28,7 @@ from magshell_fenicsx.assembly.free_parameters import FreeParameter, PlacementAm
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
 from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, EdgePressure, triangle_sides
-from magshell_fenicsx.assembly.terms import LinearTerm, Term
+from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term
 from magshell_fenicsx.continuation.system import Amplitudes
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import (
@@ -36,7 +37,7 @@ from magshell_fenicsx.mesh.mirror import (
     Mirror,
     Sector,
 )
-from magshell_fenicsx.mesh.patch import Deviation, Embedding
+from magshell_fenicsx.mesh.patch import Deviation, Embedding, UserField
 from magshell_fenicsx.models.domains import surface_domain
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.edges import FOLD_ANGLE, largest_fold
@@ -52,7 +53,9 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.spatial_fields import (
+    CellPolynomials,
     cell_geometry,
+    fields_of_placement,
     formula_field,
     positions_and_normals,
     user_field_polynomials,
@@ -95,6 +98,8 @@ from magshell_fenicsx.shells.shell_supports import ShellSupports
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.contact.pair_contact import PairContact
     from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
+
+Array = NDArray[np.float64]
 
 
 class ShellModel(ThinModel):
@@ -216,6 +221,8 @@ class ShellModel(ThinModel):
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.load_size, self.load_sizes = {}, {}
         self.kernels = KernelLog()
+        # of the functions of a program: field, its values in the model, and what reads them anew
+        self._user_values: list[tuple[UserField, Array, Callable[[], Array]]] = []
         self.V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(self.V), fem.Function(self.V, name="u")
         cells = cell_geometry(self.r0)  # in which fields are projected onto polynomials
@@ -317,14 +324,59 @@ class ShellModel(ThinModel):
         for name in ("magnetic", "remanence"):
             magnetisation = getattr(loads, name)
             if magnetisation and magnetisation.given:  # vectors as a user field
-                vectors = user_field_polynomials(magnetisation.given, self.midsurface, cells)
+                vectors = self._polynomials(magnetisation.given, cells)
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
         user_terms = (
-            term.with_functions(formula_to_field, self.midsurface.function)
+            term.with_functions(formula_to_field, self._function_of_term)
             for term in loads.user_terms
         )
         return replace(loads, user_terms=tuple(user_terms))
+
+    def _polynomials(self, user_field: UserField, cells: CellGeometry) -> CellPolynomials:
+        """Return a user's field as polynomials in cells, with values that `read_functions` sets."""
+        polynomials = user_field_polynomials(user_field, self.midsurface, cells)
+        read = partial(self.midsurface.in_cells, user_field)
+        self._user_values.append((user_field, polynomials.values, read))
+        return polynomials
+
+    def _function_of_term(self, user_field: UserField) -> fem.Function:
+        """Return a user's field as a function, with values that `read_functions` sets."""
+        function = self.midsurface.function(user_field)
+
+        def read() -> Array:
+            """Return the values of the function anew."""
+            return np.asarray(self.midsurface.function(user_field).x.array)
+
+        self._user_values.append((user_field, function.x.array, read))
+        return function
+
+    def read_functions(self) -> bool:
+        """Read the functions that a program has given again; collective.
+
+        The energies, and fields that follow from the functions, have the new values.
+
+        Returns
+        -------
+        Whether any value has changed on any rank.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if values are not allowed.
+        """
+        has_changed = False
+        for user_field, values, read in self._user_values:
+            user_field.update()
+            new_values = read()
+            has_changed |= not np.array_equal(new_values, values)
+            values[...] = new_values
+        if not self.midsurface.mesh.comm.allreduce(has_changed, MPI.LOR):
+            return False
+        forms = [term for term in self.system.terms if isinstance(term, FormTerm)]
+        for field in fields_of_placement(forms):
+            field.x.array[:] = field.rebuild(self.r0).x.array
+        return True
 
     def _put_edges_in_planes(self) -> None:
         """Move the nodes of edges with the condition "plane" into their planes."""
@@ -353,7 +405,7 @@ class ShellModel(ThinModel):
         if thickness is None:
             return None
         if thickness.user_field:
-            polynomials = user_field_polynomials(thickness.user_field, self.midsurface, cells)
+            polynomials = self._polynomials(thickness.user_field, cells)
             thickness = replace(thickness, polynomials=polynomials)
         return thickness_field(thickness, self.r0, self.midsurface.patches)
 
@@ -400,7 +452,7 @@ class ShellModel(ThinModel):
         natural = self.loads.natural.on_cells(  # a user field gives polynomials in cells
             self.midsurface.patches,
             _cell_count(self.midsurface),
-            lambda user_field: user_field_polynomials(user_field, self.midsurface, cells),
+            lambda user_field: self._polynomials(user_field, cells),
         )
         self.loads = replace(self.loads, natural=natural)
         return Shape.from_field(natural_field(natural, cells, self.V), natural, free_constants)

@@ -73,6 +73,7 @@ def follow(
         If a path is lost, a step before the last ends at an instability, or the field alone makes
         the shell unstable.
     """
+    scene.read_functions()
     state, steps = scene.unloaded(), scene.problem.programme
     # energies that are there before any load, and rise from zero first
     energies = energies_moving_the_shell(scene, state)

@@ -31,12 +31,13 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import NoJournal, NoProgress, Progress, SolverJournal
 from magshell_fenicsx.continuation.snes import NewtonOptions
 from magshell_fenicsx.continuation.stability_monitor import StabilityMonitor
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0_PLANE
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.user_mesh import UserMesh
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, make_meridian
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
@@ -363,6 +364,20 @@ class Scene:
         }
         return State(self.model.zero(), {name: values.get(name, 0.0) for name in sorted(names)})
 
+    def read_functions(self) -> None:
+        """Read the functions and constants that a program has given again; collective.
+
+        The next solve has their present values.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if a value is not allowed.
+        """
+        model = self.model
+        if model.thin and not model.axisymmetric and model.read_functions():
+            self.newton.forget_factors()
+
     def displacement(self, state: State) -> fem.Function:
         """Return the displacement of a state as a dolfinx function; collective.
 
@@ -381,19 +396,58 @@ class Scene:
             ranks solve it than hold that mesh.
         """
         self.refuse_foreign(state, allows_more=True)
-        model, surface = self.model, self.model.midsurface
+        model = self.model
         # all nodal values at the state, with those of moving supports
-        displacement = fem.Function(model.u.function_space, name="u")
-        displacement.x.array[:] = model.system.at_state(state).evaluate(
-            lambda: model.u.x.array.copy()
-        )
-        # the mesh that a program has given, if it has
+        values = model.system.at_state(state).evaluate(lambda: model.u.x.array.copy())
+        return self.on_given_mesh(values)
+
+    def on_given_mesh(self, values: Vector) -> fem.Function:
+        """Return displacements of this rank's nodes, ghosts included, as a function; collective.
+
+        It is on the mesh that a program has given, in the lengths of its coordinates; else on the
+        mesh of the model, over R.
+
+        Raises
+        ------
+        ValueError
+            If the scene models half of a user's mesh, or if other ranks solve it than hold that
+            mesh.
+        """
+        displacement = fem.Function(self.model.u.function_space, name="u")
+        displacement.x.array[:] = values
+        surface, user_mesh = self.model.midsurface, self._user_mesh()
+        if not (surface and user_mesh):
+            return displacement
+        return user_mesh.displacement(displacement, surface.source_triangles, self._user_length)
+
+    def unknowns_of(self, u: fem.Function) -> Vector:
+        """Return the unknowns of a displacement like that of `displacement`; collective."""
+        displacement = fem.Function(self.model.u.function_space)
+        surface, user_mesh = self.model.midsurface, self._user_mesh()
+        if surface and user_mesh:
+            user_mesh.put_displacement(u, displacement, surface.source_triangles, self._user_length)
+        else:
+            displacement.x.array[:] = u.x.array
+        return np.array(displacement.x.array[: self.model.system.size])
+
+    @property
+    def _user_length(self) -> float:
+        """The unit of length of a program's mesh, over R."""
+        assert self.problem.mesh_file
+        return self.problem.mesh_file.scale
+
+    def _user_mesh(self) -> UserMesh | None:
+        """Return the mesh that a program has given; None without one.
+
+        Raises
+        ------
+        ValueError
+            If its functions cannot show the displacement.
+        """
         mesh_file = self.problem.mesh_file
-        if not (surface and mesh_file):
-            return displacement
-        user_mesh = mesh_file.user_mesh
-        if not user_mesh:
-            return displacement
+        user_mesh = mesh_file.user_mesh if mesh_file and self.model.midsurface else None
+        if user_mesh is None:
+            return None
         if self.problem.is_half:
             raise ValueError(
                 "u: symmetry: half: half of the mesh is not modelled: take symmetry: none"
@@ -401,9 +455,24 @@ class Scene:
         if MPI.Comm.Compare(self.comm, user_mesh.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
                 f"u: {self.comm.size} processes solve the scene and the mesh belongs to "
-                f"{user_mesh.comm.size}: make the scene with those of the mesh, ms.Scene(problem)"
+                f"{user_mesh.comm.size}: make the scene with those of the mesh, ms.Model(problem)"
             )
-        return user_mesh.displacement(displacement, surface.source_triangles, mesh_file.scale)
+        return user_mesh
+
+    def refuse_unknown_amplitude(self, place: str, name: str) -> None:
+        """Check that the scene has an amplitude; `place` begins the message.
+
+        Raises
+        ------
+        ValueError
+            If it has none of this name.
+        """
+        names = self.unloaded().mu
+        if name not in names:
+            raise ValueError(
+                f"{place}: {name}: the scene has no such amplitude, only "
+                f"{', '.join(names) or 'none'}"
+            )
 
     def refuse_foreign(self, state: State, *, allows_more: bool = False) -> None:
         """Check that a state may be one of this scene, by its numbers and names.

@@ -57,12 +57,14 @@ def target_values(
     is_single = isinstance(amounts, str | Real) or amounts is None
     list_of_amounts: Sequence[Any] = [amounts] if is_single else cast(Sequence[Any], amounts)
     return [
-        _number(scene, name, f"trace: {key}: {amount!r}", amount, of_load)
+        number_of_amount(scene, name, f"trace: {key}: {amount!r}", amount, of_load=of_load)
         for amount in list_of_amounts
     ]
 
 
-def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> float:
+def number_of_amount(
+    scene: Scene, name: str, place: str, amount: Any, *, of_load: bool = True
+) -> float:
     """Return one amount of an amplitude, or of its conjugate, as a number of the model.
 
     Parameters
@@ -159,12 +161,10 @@ def trace(  # noqa: PLR0913
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
+    scene.read_functions()
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)
-    if name not in state.mu:
-        raise ValueError(
-            f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}"
-        )
+    scene.refuse_unknown_amplitude("trace", name)
     quantity_of_targets = quantity if control == "arc" else control
     of_load = quantity_of_targets == "load"
     targets = target_values(scene, name, "targets", targets, of_load=of_load)

@@ -212,6 +212,71 @@ def test_own_energies_with_functions(dome: Dome) -> None:
     assert ms.OwnTerm("bed", bed, (nonlinear,)).digest
 
 
+def _bed(r0: Any, u: Any, k: Any) -> Any:
+    """Energy of springs of the stiffness k."""
+    return k * ufl.dot(u.r, u.r) / 2
+
+
+# what a function of the program stands for: name -> parts and keys of the problem
+USES_OF_FUNCTIONS: Mapping[str, Callable[[Any], tuple[list[Any], dict[str, Any]]]] = {
+    "thickness": lambda f: ([], {"thickness_factor": f}),
+    "remanence": lambda f: ([ms.Field(f, [0, 0, -0.02])], {}),
+    "stretch": lambda f: ([ms.Section("natural", stretch=f)], {}),
+    "curvature": lambda f: ([ms.Section("natural", curvature=f)], {}),
+    "own energy": lambda f: ([ms.OwnTerm("bed", _bed, (f,), value=0.01)], {}),
+}
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        pytest.param(use, marks=[pytest.mark.slow] * (use not in ("thickness", "own energy")))
+        for use in USES_OF_FUNCTIONS
+    ],
+)
+def test_functions_are_read_at_each_solve(dome: Dome, use: str) -> None:
+    """A scene whose function has changed gives the numbers of a new problem.
+
+    The largest remanence stays, since loads are over it.
+    """
+    size = (3,) if use == "remanence" else ()
+    f = fem.Function(fem.functionspace(dome[0], ("Lagrange", 1, size)))
+    f.x.array[:] = 0.06 if size else 1.0
+
+    def problem() -> Any:
+        parts, keys = USES_OF_FUNCTIONS[use](f)
+        return ms.Problem(shell(dome, **keys), ms.Clamped("rim"), *parts, PRESSED, degree=3)
+
+    def observations(scene: Any) -> list[dict[str, float]]:
+        return [scene.observe(record.point.state) for record in ms.follow(scene)]
+
+    scene = ms.Model(problem(), MPI.COMM_SELF)
+    before = observations(scene)
+    f.x.array[: len(f.x.array) // 2] *= 0.9
+    after = observations(scene)
+    close(after, observations(ms.Model(problem(), MPI.COMM_SELF)))
+    assert after[-1]["volume_change"] != pytest.approx(before[-1]["volume_change"], rel=1e-6)
+
+
+@pytest.mark.parametrize("use", ["thickness", "own energy"])
+def test_constants_are_read_at_each_solve(dome: Dome, use: str) -> None:
+    constant = fem.Constant(dome[0], 1.0)
+    parts, keys = USES_OF_FUNCTIONS[use](constant)
+    scene = ms.Scene(
+        ms.Problem(shell(dome, **keys), ms.Clamped("rim"), *parts, PRESSED, degree=3),
+        MPI.COMM_SELF,
+    )
+    constant.value = 0.9
+    parts, keys = USES_OF_FUNCTIONS[use](0.9 if parts else "0.9")
+    wanted = ms.Scene(
+        ms.Problem(shell(dome, **keys), ms.Clamped("rim"), *parts, PRESSED, degree=3),
+        MPI.COMM_SELF,
+    )
+    close(
+        *([one.observe(record.point.state) for record in ms.follow(one)] for one in (scene, wanted))
+    )
+
+
 def test_the_displacement_as_a_function(dome: Dome) -> None:
     """On the user's mesh, in its lengths: at the pole, and at the rim."""
     scene = ms.Scene(ms.Problem(shell(dome), ms.Clamped("rim"), PRESSED), MPI.COMM_SELF)

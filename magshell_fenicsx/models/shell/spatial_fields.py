@@ -16,7 +16,7 @@ In: a pattern and a placement. Out: a discontinuous finite-element field on the 
 - A rim is the edge of a dimple; a patch is a named part of the mesh.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,6 +26,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.input.expressions import FormulaGroup, formula_group
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.multi_shell import ShellPose
@@ -66,6 +67,17 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
         """Make a field that is zero; the caller sets its values."""
         super().__init__(V, name=name)
         self.rebuild = rebuild
+
+
+def fields_of_placement(terms: Sequence[FormTerm]) -> list[PlacementField]:
+    """Return the fields in terms that follow from the placement, each once."""
+    coefficients = (
+        coefficient
+        for term in terms
+        for coefficient in term.form.coefficients()
+        if isinstance(coefficient, PlacementField)
+    )
+    return list(dict.fromkeys(coefficients))
 
 
 def radial(r0: Array, n0: Array) -> Array:

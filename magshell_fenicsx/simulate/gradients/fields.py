@@ -47,7 +47,11 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.residual import ParameterDerivative
-from magshell_fenicsx.models.shell.spatial_fields import PlacementField, Uniform
+from magshell_fenicsx.models.shell.spatial_fields import (
+    PlacementField,
+    Uniform,
+    fields_of_placement,
+)
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
@@ -57,7 +61,6 @@ from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState, energies_along
 from magshell_fenicsx.simulate.gradients.shape import (
-    fields_of_placement,
     of_measures,
     of_normals,
     of_widths,

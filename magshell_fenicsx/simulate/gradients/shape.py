@@ -163,17 +163,6 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
     return gradient
 
 
-def fields_of_placement(terms: Sequence[FormTerm]) -> list[PlacementField]:
-    """Return the fields in terms that follow from the placement, each once."""
-    coefficients = (
-        coefficient
-        for term in terms
-        for coefficient in term.form.coefficients()
-        if isinstance(coefficient, PlacementField)
-    )
-    return list(dict.fromkeys(coefficients))
-
-
 def rates(
     model: ShellModel | MeridianModel, field: PlacementField, normals: Array
 ) -> Iterator[Array]:

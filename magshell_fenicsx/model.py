@@ -1,0 +1,311 @@
+"""The model of a problem at a state that a program sets: residual, tangent, mass, modes, solution.
+
+A program that has its own solver (SNES, TAO, SLEPc, a time stepper, a coupled field) takes the
+model's parts here. The solvers of this package, `follow` and `trace`, take the model too.
+
+Words and units:
+
+- An amplitude is a load parameter, by name: "pressure" (p/p_c), "lambda_m", that of an own energy.
+- A state is a displacement with values of all amplitudes. Vectors are over R, in the numbering of
+  the model's unknowns; they have as many entries on a rank as the rank owns unknowns.
+- Energies are over E h R^2, residuals over E h R, tangents over E h, masses over rho h R^2. E, h,
+  R and rho are Young's modulus, thickness, reference length and density.
+- Functions are on the mesh that the program has given, in the lengths of its coordinates; without
+  one on the model's own mesh, over R.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.case.open_problem import ProblemSource, problem_of, processes
+from magshell_fenicsx.continuation.control import PrescribedLoad
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import SkewedTangent, State, Vector
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.shells.mass import mass
+from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.trace import Amount, number_of_amount
+
+SMALLEST_LOAD_STEP = 2.0**-8  # of the way from the last solution to the loads that are set
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A natural mode of the shell at a state.
+
+    Attributes
+    ----------
+    omega2
+        omega^2 rho R^2/E; negative for an unstable direction.
+    label
+        "" for a mode of the model; "m = 7" or "antisymmetric" for one that a model reduced by
+        symmetry does not have.
+    u
+        The mode, with phi . M phi = 1 over the model's mass; None where `label` is not empty.
+    """
+
+    omega2: float
+    label: str
+    u: fem.Function | None = field(default=None, repr=False)
+
+
+class Model(Scene):
+    """The finite element model of a problem, at a state that `set`, `u` and `solve` change.
+
+    The methods are collective.
+
+    Parameters
+    ----------
+    given
+        A problem, or a case, a mapping like a case file, or the path of a file.
+    comm
+        The processes; by default those of the mesh that a program gave, or all.
+    terms
+        Own energies besides those of the case.
+
+    Raises
+    ------
+    CaseError, MeshError
+        On every rank, if no model can be made.
+    """
+
+    def __init__(
+        self,
+        given: ProblemSource,
+        comm: MPI.Comm | None = None,
+        *,
+        terms: Sequence[OwnTerm] = (),
+    ) -> None:
+        comm = processes(given, comm)
+        super().__init__(problem_of(given, comm, terms), comm)
+        self._state = self._solution = self.unloaded()
+        # the function `u`, and its values when it was in agreement with the state; made when asked
+        # for
+        self._u: fem.Function | None = None
+        self._values_of_u: NDArray[np.float64] = np.empty(0)
+
+    @property
+    def u(self) -> fem.Function:
+        """The displacement, always the same function.
+
+        A program may change its values: the next call of a method takes them. They follow the
+        state at each access, and after `solve` and `put`.
+        """
+        self._show(self.state)
+        assert self._u is not None
+        return self._u
+
+    @property
+    def state(self) -> State:
+        """The displacement as a vector, with the amplitudes by name."""
+        if self._u is not None:
+            has_changed = not np.array_equal(self._u.x.array, self._values_of_u)
+            if self.comm.allreduce(has_changed, MPI.LOR):
+                self._state = State(self.unknowns_of(self._u), self._state.mu)
+                self._values_of_u = self._u.x.array.copy()
+        return self._state
+
+    def _show(self, state: State) -> None:
+        """Give the function `u` the values of a state; the first call makes it."""
+        u = self.displacement(state)
+        self._u = self._u or u
+        self._u.x.array[:] = u.x.array
+        self._values_of_u = u.x.array.copy()
+
+    def _move_to(self, state: State) -> None:
+        """Put the model into a state, and the function `u` if there is one."""
+        self._state = state
+        if self._u is not None:
+            self._show(state)
+
+    @property
+    def amplitudes(self) -> dict[str, float]:
+        """The loads by name, each in the unit of its amplitude."""
+        return dict(self._state.mu)
+
+    @property
+    def held(self) -> NDArray[np.int32]:
+        """Numbers of this rank's unknowns that supports hold or move."""
+        return self.model.system.fixed_unknowns
+
+    def set(self, **amplitudes: Amount) -> None:
+        """Set amplitudes by name; the displacement stays.
+
+        Parameters
+        ----------
+        amplitudes
+            Numbers in the unit of the amplitude, or texts such as "100 Pa" in a case with units.
+
+        Raises
+        ------
+        ValueError
+            If the model has no such amplitude, or it has no unit of that kind.
+        """
+        numbers = {}
+        for name, amount in amplitudes.items():
+            self.refuse_unknown_amplitude("set", name)
+            numbers[name] = number_of_amount(self, name, f"set: {name}: {amount!r}", amount)
+        self._state = State(self.state.u, self._state.mu | numbers)
+
+    def put(self, state: State | Record | PETSc.Vec) -> None:
+        """Put the model into a state.
+
+        Parameters
+        ----------
+        state
+            A state or a record of this model, with its amplitudes; or unknowns as a PETSc vector,
+            at the amplitudes that are set.
+
+        Raises
+        ------
+        ValueError
+            If it is of another model.
+        """
+        if isinstance(state, PETSc.Vec):
+            state = State(np.array(state.array_r), self._state.mu)
+        if isinstance(state, Record):
+            state = state.point.state
+        self.refuse_foreign(state)
+        self._move_to(state)
+
+    def unknowns(self) -> PETSc.Vec:
+        """Return the displacement as a vector of its own."""
+        return self._vector(self.state.u)
+
+    def residual(self) -> PETSc.Vec:
+        """Return R = dPi/du, zero at unknowns that are held; a vector of its own."""
+        self.read_functions()
+        return self._vector(self.model.system.residual(self.state.u, self._state.mu))
+
+    def tangent(self) -> PETSc.Mat:
+        """Return K = dR/du, a matrix of its own; not symmetric where a load has no potential.
+
+        Rows and columns of held unknowns are those of the unit matrix.
+        """
+        self.read_functions()
+        tangent = self.model.system.tangent(self.state.u, self._state.mu)
+        if not isinstance(tangent, SkewedTangent):
+            return tangent.copy()
+        K = tangent.K.copy()
+        K.setOption(PETSc.Mat.Option.SYMMETRIC, False)
+        K.axpy(1.0, tangent.N, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        return K
+
+    def mass(self) -> PETSc.Mat:
+        """Return the consistent mass of the undeformed shell, a matrix of its own.
+
+        Rows and columns of held unknowns are zero; there is no rotary inertia.
+        """
+        self.read_functions()
+        return mass(self.model)
+
+    def energies(self) -> dict[str, float]:
+        """Return the energy of each term by name; that of a load for the amplitude 1."""
+        self.read_functions()
+        return self.model.system.energies(self.state.u, self._state.mu)
+
+    def solve(self) -> Record:
+        """Find the equilibrium at the amplitudes that are set, and put the model there.
+
+        Newton's method starts at the state. If it fails, it starts at the last solution, and the
+        amplitudes go from there in steps that it manages.
+
+        Returns
+        -------
+        Record
+            The equilibrium with its number of unstable directions, for `columns`, `picture`,
+            `trace` and others.
+
+        Raises
+        ------
+        Stopped
+            If no equilibrium is found; the state stays.
+        """
+        self.read_functions()
+        target = self.state
+        state, reason = self._equilibrium(target)
+        if state is None:
+            state = self._step_by_step(target, reason)
+        self._solution = state
+        self._move_to(state)
+        pivots = 0
+        if not (self.allows_rigid_motion or self.free_in_time):
+            pivots = self.newton.factor_at(state).negative_pivots
+        point = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots)
+        return Record("target", "", point, shown=self.displacement, scene=self)
+
+    def modes(self, count: int = 6) -> list[Mode]:
+        """Return the natural modes of lowest frequency at the state, ascending.
+
+        Unstable directions are all among them, even if they are more than `count`.
+
+        Raises
+        ------
+        ModesNotFound
+            If the iteration for the eigenvalues does not find them.
+        """
+        self.read_functions()
+        shell_modes = ShellModes(self.model).vibrations(
+            self.state, count, allows_rigid_motion=self.allows_rigid_motion
+        )
+        return [
+            Mode(mode.eigenvalue, mode.label, None if mode.label else self.function(mode.vector))
+            for mode in shell_modes
+        ]
+
+    def function(self, vector: PETSc.Vec | Vector) -> fem.Function:
+        """Return a vector of the model's unknowns as a function, such as an eigenvector."""
+        local = vector.array_r if isinstance(vector, PETSc.Vec) else vector
+        return self.on_given_mesh(self.model.system.with_ghosts(np.array(local)))
+
+    def _vector(self, values: Vector) -> PETSc.Vec:
+        """Return values of this rank's unknowns as a PETSc vector."""
+        return PETSc.Vec().createWithArray(values.copy(), comm=self.comm)
+
+    def _equilibrium(self, guess: State) -> tuple[State | None, str]:
+        """Return the equilibrium near a state at its amplitudes, or None and the reason."""
+        if not guess.mu:
+            raise Stopped("solve: the model has no load")
+        name = next(iter(guess.mu))  # any of them, since it does not change
+        outcome = self.newton.solve(guess, name, PrescribedLoad(name, guess.mu[name]))
+        if not outcome.converged:
+            return None, outcome.reason
+        system = self.model.system
+        state = system.advance(outcome.state, self._solution.mu)
+        return system.with_moved_supports(state), ""
+
+    def _step_by_step(self, target: State, reason: str) -> State:
+        """Return the equilibrium at the amplitudes of a state, from the last solution on.
+
+        Parameters
+        ----------
+        reason
+            Why Newton's method has failed at the target.
+        """
+        start = state = self._solution
+        reached, step = 0.0, 0.5
+        while reached < 1.0:
+            fraction = min(reached + step, 1.0)
+            mu = {
+                name: start.mu.get(name, 0.0) + fraction * (value - start.mu.get(name, 0.0))
+                for name, value in target.mu.items()
+            }
+            next_state, reason_of_step = self._equilibrium(State(state.u, mu))
+            if next_state is not None:
+                state, reached, step = next_state, fraction, 2 * step
+                continue
+            reason, step = reason_of_step, step / 2
+            if step < SMALLEST_LOAD_STEP:
+                raise Stopped(
+                    f"solve: no equilibrium beyond {reached:.4g} of the way from the last "
+                    f"solution to the loads that are set: {reason}"
+                )
+        return state
