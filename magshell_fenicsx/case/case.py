@@ -267,7 +267,8 @@ class Case(WithParts):
         """
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
-        return make_problem(self, smooth=smooth)
+        make = partial(make_problem, self, smooth=smooth)
+        return make().made_by(make)
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:

@@ -9,7 +9,7 @@ same for any number of ranks; local numbers are those of one rank. Own cells are
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NoReturn
 
 import basix
 import numpy as np
@@ -75,6 +75,12 @@ class UserMesh:
         self._owned = cell_map.size_local
         self._numbers = self._original_numbers(cell_map)
         self._spaces: dict[int, fem.FunctionSpace] = {}
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError(
+            "a dolfinx mesh belongs to its process and cannot be pickled: make the problem in each "
+            "process, or write the mesh to a file that a case names"
+        )
 
     def triangles(
         self,

@@ -175,9 +175,11 @@ def _needs_inertia_alone(step: ProgrammeStep) -> bool:
     return isinstance(step.load, TimeSection) and step.load.needs_inertia_alone
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Problem:
     """Everything that will be computed, dimensionless (lengths in R).
+
+    It can be pickled if it is as its case has made it.
 
     Attributes
     ----------
@@ -235,6 +237,9 @@ class Problem:
     remade
         Function of values by keys that makes the problem of the case with these; see `with_values`.
         None without a case.
+    maker
+        Function that makes the same problem again, in another process; None if it was changed since
+        its case made it.
     """
 
     context: Context
@@ -270,6 +275,35 @@ class Problem:
     pending_modes: PendingModes | None = None
     document: Document = field(default_factory=Document)
     remade: "Callable[[Mapping[str, Any]], Problem] | None" = None
+    # `dataclasses.replace` does not copy it
+    maker: "Callable[[], Problem] | None" = field(default=None, init=False, compare=False)
+
+    def made_by(self, maker: "Callable[[], Problem]") -> "Problem":
+        """Return the problem itself, with the function that makes it again."""
+        object.__setattr__(self, "maker", maker)
+        return self
+
+    def __reduce__(self) -> "tuple[Callable[[], Problem], tuple[()]]":
+        """Return what makes the problem again where it is unpickled."""
+        if self.maker is None:
+            raise TypeError(
+                "a problem that was changed since its case made it cannot be pickled: pickle that "
+                "of ms.Problem, or the case"
+            )
+        return self.maker, ()
+
+    def __repr__(self) -> str:
+        """Return the problem in a few lines."""
+        supports = ", ".join(f"{name} {condition}" for name, condition in self.conditions.items())
+        steps = ", ".join(step.kind for step in self.programme)
+        lines = [
+            f"Problem {self.document.name}",
+            f"  shell    {self.context.shell.geometry}, R/h = {1 / self.material.h:.6g}",
+            f"  model    {', '.join(self.included)}",
+            f"  supports {supports or 'none'}",
+            f"  steps    {steps or 'none'}",
+        ]
+        return "\n".join(lines)
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:

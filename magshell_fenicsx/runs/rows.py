@@ -7,7 +7,8 @@ of all points, which a resumed run takes from there. h is the thickness.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from html import escape
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from magshell_fenicsx.simulate.scene import Scene
 if TYPE_CHECKING:
     import pandas
 
+ROWS_SHOWN = 30  # of a table in a notebook
 SUMMED_COLUMNS = ("time", "dissipated", "work")
 
 
@@ -200,6 +202,28 @@ class Table(dict[str, NDArray[np.generic]]):
         names = ", ".join([*self][3:5])
         raise KeyError(f"{key!r}: columns have names, such as {names}; rows are in result.rows")
 
+    def __repr__(self) -> str:
+        """Return the size and the names of the columns."""
+        return f"Table of {self._row_count} rows: {', '.join(self)}"
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as a table of a notebook, without columns that are all zero."""
+        names = [name for name, values in self.items() if np.any(values != np.zeros_like(values))]
+        shown = min(self._row_count, ROWS_SHOWN)
+        head = "".join(f"<th>{escape(name)}</th>" for name in names)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{_cell(self[name][i])}</td>" for name in names) + "</tr>"
+            for i in range(shown)
+        )
+        rest = self._row_count - shown
+        more = f"<p>and {rest} further rows</p>" if rest else ""
+        return f"<table><tr>{head}</tr>{rows}</table>{more}"
+
+    @property
+    def _row_count(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.values()), ()))
+
     def to_pandas(self) -> "pandas.DataFrame":
         """Return a frame of pandas, which the package does not need otherwise.
 
@@ -215,6 +239,11 @@ class Table(dict[str, NDArray[np.generic]]):
                 "to_pandas: needs pandas: python3 -m pip install pandas"
             ) from None
         return pandas.DataFrame(dict(self))
+
+
+def _cell(value: Any) -> str:
+    """Return a value as the text of a cell: numbers with six digits."""
+    return escape(f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
 def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:

@@ -127,7 +127,7 @@ def _first_at(fraction: float, times: Array, part_of_way: Array) -> float:
     )
 
 
-@dataclass
+@dataclass(repr=False)
 class Result:
     """The result of a run.
 
@@ -208,6 +208,20 @@ class Result:
     mode_places: dict[int, list[float]] = field(default_factory=dict)
     last_record: Record | None = None
     scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Return the result in a few lines: how it ended, and its instabilities."""
+        lines = [f"Result of {self.scene.problem.document.name}: {len(self.rows)} points"]
+        if self.stopped:
+            lines.append(f"  stopped: {self.stopped}")
+        lines += [f"  {record!r}" for record in self.instabilities]
+        if self.last_record:
+            lines.append(f"  end: {self.last_record!r}")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """Return the columns of the path as a table of a notebook."""
+        return self.history._repr_html_()
 
     @cached_property
     def error_estimates(self) -> ErrorEstimates:

@@ -7,7 +7,7 @@ break it.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
@@ -25,9 +25,11 @@ AT_POINT_FORCES = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Record:
     """A point of the history, a row of path.csv, with its origin.
+
+    A pickled record has its numbers alone: no scene, and no function `u`.
 
     Attributes
     ----------
@@ -78,14 +80,35 @@ class Record:
     scene: "Scene | None" = field(default=None, compare=False, repr=False)
     said: str = ""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: a scene belongs to its process."""
+        return vars(self) | {"shown": None, "scene": None}
+
+    def __repr__(self) -> str:
+        """Return the record in a line: its label, amplitudes and stability."""
+        amplitudes = ", ".join(
+            f"{name} = {value:.9g}" for name, value in self.point.state.mu.items()
+        )
+        mode = f" ({self.mode})" if self.mode else ""
+        unstable = self.point.negative_pivots + self.excluded_pivots
+        return f"Record {self.label}{mode}: {amplitudes or 'no load'}; {unstable} unstable"
+
     @property
     def u(self) -> "fem.Function":
         """The displacement as a dolfinx function; collective.
 
         It is on the mesh that a program has given, in the lengths of its coordinates; else on the
         scene's own mesh, which is flat triangles or the meridian, in R.
+
+        Raises
+        ------
+        ValueError
+            If the record was pickled.
         """
-        assert self.shown, "of a record of follow or trace"
+        if self.shown is None:
+            raise ValueError(
+                "u: this record comes from another process: model.put(record), then model.u"
+            )
         return self.shown(self.point.state)
 
 

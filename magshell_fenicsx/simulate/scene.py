@@ -282,6 +282,11 @@ class Scene:
         vars(copied_scene).update(attributes | changes)
         return copied_scene
 
+    def __repr__(self) -> str:
+        """Return the model in a line."""
+        kind, name = type(self).__name__, self.problem.document.name
+        return f"{kind} of {name}: {self.cells} cells, {self.model.system.dofs} unknowns"
+
     @property
     def plan(self) -> Problem:
         """The name of `problem` in earlier versions."""
