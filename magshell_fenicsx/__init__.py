@@ -6,10 +6,11 @@
 0.32624
 
 Without a case file, `Problem` is made of a `Shell`, on a dolfinx mesh for instance, and of what
-holds and loads it. A scene is stepped through by `follow` (the history of its case) and `trace` (a
-path in any amplitude); `gradient` differentiates what was found by amplitudes, numbers of the case
-and fields; `columns`, `surface`, `polydata`, `curve` and `picture` show what was found; an
-`OwnTerm` is one's own energy, whose `Free` parameters are amplitudes too.
+holds and loads it. A `Model` has its residual, tangent and mass at any state; `follow` (the history
+of its case) and `trace` (a path in any amplitude) step through it; `gradient` differentiates what
+was found by amplitudes, numbers of the case and fields; `columns`, `surface`, `polydata`, `curve`
+and `picture` show what was found; an `OwnTerm` is one's own energy, whose `Free` parameters are
+amplitudes too.
 """
 
 from importlib import import_module
@@ -22,10 +23,12 @@ if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.input.source import CaseError
     from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.model import Mode, Model
     from magshell_fenicsx.models.shell import kinematics
     from magshell_fenicsx.models.shell.kinematics import Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
-    from magshell_fenicsx.public import Scene, boundary, follow, identify, run
+    from magshell_fenicsx.public import Scene as Scene
+    from magshell_fenicsx.public import boundary, ensemble, follow, identify, run, sweep
     from magshell_fenicsx.python import (
         Clamped,
         Field,
@@ -60,13 +63,14 @@ __all__ = [
     "Hinged",
     "Jet",
     "MeshError",
+    "Mode",
+    "Model",
     "OnPlane",
     "OwnTerm",
     "Pressure",
     "Problem",
     "Record",
     "Result",
-    "Scene",
     "Section",
     "Shell",
     "Step",
@@ -76,6 +80,7 @@ __all__ = [
     "boundary",
     "columns",
     "curve",
+    "ensemble",
     "fold_at",
     "follow",
     "gradient",
@@ -88,6 +93,7 @@ __all__ = [
     "sensitivities",
     "solutions",
     "surface",
+    "sweep",
     "trace",
 ]
 
@@ -99,7 +105,7 @@ _NAMES_OF_MODULES = {
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",
     "model": "Mode Model",
-    "public": "Scene boundary follow identify run",
+    "public": "Scene boundary ensemble follow identify run sweep",
     "python": "Clamped Field Force Held Hinged OnPlane Pressure Problem Section Shell Step",
     "runs.notebook": "curve off_screen picture polydata surface",
     "runs.rows": "Table columns",

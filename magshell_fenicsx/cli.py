@@ -14,6 +14,7 @@ from magshell_fenicsx.command import (
     STOPPED,
     CaseFile,
     Commands,
+    Jobs,
     Over,
     Result,
     Settings,
@@ -208,6 +209,7 @@ def sweep(
         bool,
         typer.Option("--full-paths", help="compute the full path at every point; follow no fold"),
     ] = False,
+    jobs: Jobs = 1,
     part: Annotated[
         str | None,
         typer.Option(
@@ -216,9 +218,13 @@ def sweep(
     ] = None,
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
+    from magshell_fenicsx.studies.runner import local_processes
     from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
-    with study_folder(out, f"{case.stem}_sweep") as folder:
+    with (
+        study_folder(out, f"{case.stem}_sweep") as folder,
+        local_processes(jobs) as executor,
+    ):
         outcome = run_sweep(
             case,
             over,
@@ -228,6 +234,7 @@ def sweep(
             result=result,
             full_paths=full_paths,
             part=part,
+            executor=executor,
         )
     if outcome.stopped:
         raise failure(
@@ -336,6 +343,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             min=0, metavar="N", help="also compute each sample without its N weakest defects"
         ),
     ] = 0,
+    jobs: Jobs = 1,
     part: Annotated[
         str | None,
         typer.Option(
@@ -357,8 +365,12 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     samples.
     """
     from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
+    from magshell_fenicsx.studies.runner import local_processes
 
-    with study_folder(out, f"{case.stem}_ensemble") as folder:
+    with (
+        study_folder(out, f"{case.stem}_ensemble") as folder,
+        local_processes(jobs) as executor,
+    ):
         outcome = run_ensemble(
             case,
             set_ or [],
@@ -371,6 +383,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             merge=merge or [],
             delete_weakest=delete_weakest,
             resume=resume,
+            executor=executor,
         )
         if (mean := outcome.content["mean"]) is not None:
             found_count = len(outcome.rows) - outcome.without_result

@@ -79,6 +79,12 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case"),
 ]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        min=1, max=1024, metavar="N", help="compute N at a time, in processes of this machine"
+    ),
+]
 Over = Annotated[
     list[str],
     typer.Option(

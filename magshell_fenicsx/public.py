@@ -5,6 +5,7 @@ computed; a scene is a problem with its finite element model. The processes are 
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 from warnings import warn
@@ -27,7 +28,9 @@ from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
 
 if TYPE_CHECKING:
     from magshell_fenicsx.studies.boundary.stability_boundary import StabilityBoundary
+    from magshell_fenicsx.studies.ensemble.ensemble import Ensemble
     from magshell_fenicsx.studies.identify.identification import Identified
+    from magshell_fenicsx.studies.sweep.sweep import Sweep
 
 Say = Callable[[str], None]
 
@@ -57,7 +60,7 @@ class Scene(Model):
     ) -> None:
         if plan is not None:
             warn(
-                "Scene(case, plan=problem) is now Model(problem)", DeprecationWarning, stacklevel=2
+                "Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2
             )
         super().__init__(plan or case, comm, terms=terms)
         self._given = case
@@ -66,7 +69,7 @@ class Scene(Model):
     def case(self) -> Case:
         """The case that the scene was made of, as in earlier versions."""
         warn(
-            "Scene.case is now Model.problem, which has all that is computed",
+            "Scene.case is now Scene.problem, which has all that is computed",
             DeprecationWarning,
             stacklevel=2,
         )
@@ -95,6 +98,91 @@ def follow(
     """
     scene = given if isinstance(given, SceneOfProblem) else Model(given)
     return follow_scene(scene, search=search, remark=remark)
+
+
+def sweep(
+    file: Path | str,
+    over: Sequence[str],
+    settings: Sequence[str] = (),
+    out: Path | str = "results/sweep",
+    say: Say = lambda line: None,
+    *,
+    result: str | None = None,
+    full_paths: bool = False,
+    executor: Executor | None = None,
+) -> "Sweep":
+    """Run a case file at all points of a product of axes; see `studies.sweep.sweep.sweep`.
+
+    Parameters
+    ----------
+    over
+        One axis each: "KEY=START:STOP:COUNT" or "KEY=VALUE,VALUE"; keys tied with `+`.
+    settings
+        Texts "KEY=VALUE" that replace keys of the case.
+    out
+        Folder of sweep.csv and of the points, which are kept.
+    result
+        A further number of each point, as of `magshell sweep --result`.
+    full_paths
+        Compute the full path at every point.
+    executor
+        Processes that compute points, such as `concurrent.futures.ProcessPoolExecutor`; they see
+        the same files. None: the ranks of MPI.
+    """
+    from magshell_fenicsx.studies.sweep.sweep import sweep as sweep_case
+
+    return sweep_case(
+        file,
+        over,
+        settings,
+        out,
+        say=say,
+        make_case=Case.from_source,
+        result=result,
+        full_paths=full_paths,
+        executor=executor,
+    )
+
+
+def ensemble(
+    file: Path | str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/ensemble",
+    say: Say = lambda line: None,
+    *,
+    samples: int,
+    seed: int,
+    result: str = "knockdown",
+    executor: Executor | None = None,
+) -> "Ensemble":
+    """Compute random samples of a case file; see `studies.ensemble.ensemble.ensemble`.
+
+    Parameters
+    ----------
+    settings
+        Texts "KEY=VALUE" that replace keys of the case.
+    out
+        Folder of samples.csv and of the samples, which are kept.
+    samples, seed
+        Number of samples, and the seed of their random numbers.
+    result
+        Result of each sample, as of `magshell ensemble --result`.
+    executor
+        Processes that compute samples, as of `sweep`. None: the ranks of MPI.
+    """
+    from magshell_fenicsx.studies.ensemble.ensemble import ensemble as compute_ensemble
+
+    return compute_ensemble(
+        file,
+        settings,
+        samples=samples,
+        seed=seed,
+        make_case=Case.from_source,
+        result=result,
+        out=out,
+        say=say,
+        executor=executor,
+    )
 
 
 def boundary(

@@ -10,12 +10,14 @@ shells. An `OwnTerm` is an energy that a program defines.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import atan2, degrees, hypot
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from textwrap import shorten
+from typing import Any, Literal, TypeAlias, Unpack, get_args
 
 import numpy as np
+import ufl
 from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from pydantic import BaseModel
@@ -31,6 +33,7 @@ from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
+from magshell_fenicsx.python_keys import FieldKeys, ForceKeys, PressureKeys
 
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
@@ -192,6 +195,13 @@ class Shell:
         """
         if isinstance(value, fem.Function | fem.Constant):
             return self.user_field(value, key)
+        if callable(value) or isinstance(value, ufl.core.expr.Expr):
+            kind = "a function of Python" if callable(value) else "an expression"
+            raise CaseError(
+                f"{NAME}: {key}: is {kind}"
+                ': give a formula such as "1 + 0.2*x", or a dolfinx function: '
+                "f = fem.Function(V); f.interpolate(...)"
+            )
         if isinstance(value, np.ndarray | np.generic):
             return value.tolist()
         if isinstance(value, Mapping):
@@ -220,23 +230,27 @@ class Shell:
         return self.user_mesh.field(function, key)
 
 
-@dataclass(frozen=True)
 class ProblemPart:
     """Part of a `Problem`: a section of a case, or a step of its programme.
 
-    Attributes
+    Parameters
     ----------
     key
         Key of the section; "loading" of a step.
     keys
         Function of the shell with the keys of the section and their values.
+    text
+        The part as a program writes it.
     """
 
-    key: str
-    keys: Callable[[Shell], Keys] = field(repr=False)
+    def __init__(self, key: str, keys: Callable[[Shell], Keys], text: str) -> None:
+        self.key, self.keys, self._text = key, keys, text
+
+    def __repr__(self) -> str:
+        return self._text
 
 
-def Section(key: str, **keys: Any) -> ProblemPart:
+class Section(ProblemPart):
     """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, ...
 
     A section that is a list is a keyword of `Problem` instead: `joints=[...]`, `contact=[...]`.
@@ -253,18 +267,24 @@ def Section(key: str, **keys: Any) -> ProblemPart:
     CaseError
         If a case has no such section, or the section has no such key.
     """
-    if key not in Case.model_fields:
-        raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
-    annotation = Case.model_fields[key].annotation
-    types = [member for member in (annotation, *get_args(annotation)) if isinstance(member, type)]
-    sections = [member for member in types if issubclass(member, BaseModel)]
-    # lists, and mappings of names to sections, have no keys that could be checked here
-    if len(sections) == 1:
-        refuse_unknown(keys, sections[0], f"{NAME}: {key}")
-    return ProblemPart(key, lambda shell: shell.plain_value(keys, key))
+
+    def __init__(self, key: str, **keys: Any) -> None:
+        if key not in Case.model_fields:
+            raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
+        annotation = Case.model_fields[key].annotation
+        types = [
+            member for member in (annotation, *get_args(annotation)) if isinstance(member, type)
+        ]
+        sections = [member for member in types if issubclass(member, BaseModel)]
+        # lists, and mappings of names to sections, have no keys that could be checked here
+        if len(sections) == 1:
+            refuse_unknown(keys, sections[0], f"{NAME}: {key}")
+        super().__init__(
+            key, lambda shell: shell.plain_value(keys, key), _call_text("Section", (key,), keys)
+        )
 
 
-def Step(kind: str, **keys: Any) -> ProblemPart:
+class Step(ProblemPart):
     """A step of the programme, of any kind that a case has.
 
     Parameters
@@ -279,21 +299,34 @@ def Step(kind: str, **keys: Any) -> ProblemPart:
     CaseError
         If a case has no such kind, or the step has no such key.
     """
-    kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
-    if kind not in STEPS:
-        raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
-    refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
-    return ProblemPart(
-        "loading", lambda shell: shell.plain_value({"kind": kind, **keys}, "loading")
-    )
+
+    def __init__(self, kind: str, **keys: Any) -> None:
+        kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
+        if kind not in STEPS:
+            raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
+        refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
+        data = {"kind": kind, **keys}
+        super().__init__(
+            "loading",
+            lambda shell: shell.plain_value(data, "loading"),
+            _call_text("Step", (kind,), keys),
+        )
 
 
-def Pressure(**keys: Any) -> ProblemPart:
-    """A live pressure; by default up to the first instability."""
-    return Step("pressure", **keys)
+class Pressure(Step):
+    """A live pressure; by default up to the first instability.
+
+    Parameters
+    ----------
+    keys
+        Keys of a step of kind "pressure" in a case.
+    """
+
+    def __init__(self, **keys: Unpack[PressureKeys]) -> None:
+        super().__init__("pressure", **keys)
 
 
-def Force(at: Mapping[str, Any] | str, **keys: Any) -> ProblemPart:
+class Force(Step):
     """A force along the inward normal at one point.
 
     Parameters
@@ -301,22 +334,46 @@ def Force(at: Mapping[str, Any] | str, **keys: Any) -> ProblemPart:
     at
         Name of a point, or angles as in a case.
     keys
-        Further keys of the step "indentation".
+        Keys of a step of kind "indentation" in a case; `depth` or `force` is where it ends.
     """
-    return Step("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
+
+    def __init__(self, at: Mapping[str, Any] | str, **keys: Unpack[ForceKeys]) -> None:
+        super().__init__("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
+        if not keys.keys() & {"depth", "force", "until"}:
+            raise CaseError(
+                f'{NAME}: Force: {at}: where does it end? give depth, such as "2 mm", or force, or '
+                'until="limit"'
+            )
 
 
-def Clamped(*names: str) -> ProblemPart:
+class _Support(ProblemPart):
+    """A part that gives several named edges, patches or points one support condition."""
+
+    def __init__(self, condition: Any, names: Sequence[str], text: str) -> None:
+        for name in names:
+            if not isinstance(name, str):
+                raise CaseError(
+                    f"{NAME}: boundary: {name!r}: is no name: name the tag in ms.Shell, "
+                    'edges={"rim": ...}'
+                )
+        super().__init__("boundary", lambda shell: dict.fromkeys(names, condition), text)
+
+
+class Clamped(_Support):
     """Edges or patches without displacement and rotation."""
-    return _supports("clamped", names)
+
+    def __init__(self, *names: str) -> None:
+        super().__init__("clamped", names, _call_text("Clamped", names))
 
 
-def Hinged(*names: str) -> ProblemPart:
+class Hinged(_Support):
     """Edges or patches without displacement."""
-    return _supports("hinged", names)
+
+    def __init__(self, *names: str) -> None:
+        super().__init__("hinged", names, _call_text("Hinged", names))
 
 
-def Held(name: str, components: str) -> ProblemPart:
+class Held(_Support):
     """A support without displacements along some axes.
 
     Parameters
@@ -326,22 +383,26 @@ def Held(name: str, components: str) -> ProblemPart:
     components
         Axes along which it cannot move, such as "xz".
     """
-    return _supports({"held": list(components)}, [name])
+
+    def __init__(self, name: str, components: str) -> None:
+        super().__init__({"held": list(components)}, [name], _call_text("Held", (name, components)))
 
 
-def OnPlane(*names: str) -> ProblemPart:
+class OnPlane(_Support):
     """Edges in a mirror plane of a shape of which the shell is a part."""
-    return _supports("symmetry", names)
+
+    def __init__(self, *names: str) -> None:
+        super().__init__("symmetry", names, _call_text("OnPlane", names))
 
 
-def _supports(condition: Any, names: Sequence[str]) -> ProblemPart:
-    """Return a part that gives several named edges, patches or points one support condition."""
-    return ProblemPart("boundary", lambda shell: dict.fromkeys(names, condition))
+def _call_text(name: str, arguments: Sequence[Any], keys: Mapping[str, Any] | None = None) -> str:
+    """Return a call of a class as a program writes it, shortened where values are long."""
+    texts = [repr(value) for value in arguments]
+    texts += [f"{key}={value!r}" for key, value in (keys or {}).items()]
+    return f"{name}({shorten(', '.join(texts), 200)})"
 
 
-def Field(
-    remanent: Vector, applied: Vector, *, lambda_m: float | None = None, **keys: Any
-) -> ProblemPart:
+class Field(ProblemPart):
     """Remanence and applied field; in tesla, or with `lambda_m` over their magnitudes.
 
     Parameters
@@ -357,19 +418,29 @@ def Field(
         What else a case has under `magnetic`.
     """
 
-    def magnetic_keys(shell: Shell) -> Keys:
-        """Return the section `magnetic` of a case with this shell."""
-        dimensionless = lambda_m is not None
-        section: Keys = {
-            "remanent": _flux(remanent, shell, "magnetic.remanent", dimensionless=dimensionless),
-            "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
-            **shell.plain_value(keys, "magnetic"),
-        }
-        if dimensionless:
-            section["lambda_m"] = shell.plain_value(lambda_m, "magnetic.lambda_m")
-        return section
+    def __init__(
+        self,
+        remanent: Vector,
+        applied: Vector,
+        *,
+        lambda_m: float | None = None,
+        **keys: Unpack[FieldKeys],
+    ) -> None:
+        def magnetic_keys(shell: Shell) -> Keys:
+            """Return the section `magnetic` of a case with this shell."""
+            dimensionless = lambda_m is not None
+            section: Keys = {
+                "remanent": _flux(
+                    remanent, shell, "magnetic.remanent", dimensionless=dimensionless
+                ),
+                "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
+                **shell.plain_value(keys, "magnetic"),
+            }
+            if dimensionless:
+                section["lambda_m"] = shell.plain_value(lambda_m, "magnetic.lambda_m")
+            return section
 
-    return ProblemPart("magnetic", magnetic_keys)
+        super().__init__("magnetic", magnetic_keys, _call_text("Field", (remanent, applied), keys))
 
 
 def _refuse_mesh_keys(geometry: str, **mesh_keys: Any) -> None:
@@ -494,14 +565,14 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
     return {**direction, **magnitude_key(hypot(x, y, z))}
 
 
-def Problem(
-    shell: Shell | Sequence[Shell],
-    *parts: ProblemPart | OwnTerm,
-    points: Mapping[str, Sequence[Any]] | None = None,
-    degree: int | None = None,
-    symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
-    **sections: Any,
-) -> problem.Problem:
+class _ProblemType(type):
+    """Type of `Problem`: problems of cases, too, are instances of it."""
+
+    def __instancecheck__(cls, instance: object) -> bool:
+        return isinstance(instance, problem.Problem)
+
+
+class Problem(problem.Problem, metaclass=_ProblemType):
     """A complete problem, for `follow`, `Scene` and other functions that take a problem.
 
     Parameters
@@ -528,45 +599,57 @@ def Problem(
     CaseError, MeshError
         One message with every mistake; on every rank.
     """
-    member_shells = list(shell) if isinstance(shell, list | tuple) else []
-    if member_shells:
-        # any of them turns values into plain ones: none has a mesh, and so no functions
-        shell = member_shells[0]
-        _refuse_unfit_shells(member_shells)
-    if not isinstance(shell, Shell):
-        raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    case_data = {
-        **_shell_data(shell, member_shells),
-        "boundary": {},
-        **shell.plain_value(sections, "case"),
-    }
-    steps, own_terms = list[Keys](), list[OwnTerm]()
-    for part in parts:
-        if isinstance(part, OwnTerm):
-            own_terms.append(_on_mesh(part, shell))
-        elif not isinstance(part, ProblemPart):
-            raise CaseError(
-                f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and "
-                "OwnTerm"
-            )
-        elif part.key == "loading":
-            steps.append(part.keys(shell))
-        else:
-            _join(case_data, part.key, part.keys(shell))
-    if steps and "loading" in case_data:
-        raise CaseError(f"{NAME}: loading: is given twice, as steps and as a section")
-    if steps:
-        case_data["loading"] = steps[0] if len(steps) == 1 else steps
-    _join(case_data, "points", shell.plain_value(points or {}, "points"))
-    if member_shells:
-        _distribute(case_data)
-    if degree is not None:
-        _join(case_data, "mesh", {"degree": degree})
-    if symmetry or shell.user_mesh:
-        case_data["symmetry"] = symmetry or "none"
-    return (
-        Case.from_source(Source(NAME, case_data, files=shell.files)).with_terms(own_terms).problem()
-    )
+
+    def __new__(  # type: ignore[misc]  # a problem is the same whatever makes it
+        cls,
+        shell: Shell | Sequence[Shell],
+        *parts: ProblemPart | OwnTerm,
+        points: Mapping[str, Sequence[Any]] | None = None,
+        degree: int | None = None,
+        symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
+        **sections: Any,
+    ) -> problem.Problem:
+        member_shells = list(shell) if isinstance(shell, list | tuple) else []
+        if member_shells:
+            # any of them turns values into plain ones: none has a mesh, and so no functions
+            shell = member_shells[0]
+            _refuse_unfit_shells(member_shells)
+        if not isinstance(shell, Shell):
+            raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
+        case_data = {
+            **_shell_data(shell, member_shells),
+            "boundary": {},
+            **shell.plain_value(sections, "case"),
+        }
+        steps, own_terms = list[Keys](), list[OwnTerm]()
+        for part in parts:
+            if isinstance(part, OwnTerm):
+                own_terms.append(_on_mesh(part, shell))
+            elif not isinstance(part, ProblemPart):
+                raise CaseError(
+                    f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, "
+                    "and OwnTerm"
+                )
+            elif part.key == "loading":
+                steps.append(part.keys(shell))
+            else:
+                _join(case_data, part.key, part.keys(shell))
+        if steps and "loading" in case_data:
+            raise CaseError(f"{NAME}: loading: is given twice, as steps and as a section")
+        if steps:
+            case_data["loading"] = steps[0] if len(steps) == 1 else steps
+        _join(case_data, "points", shell.plain_value(points or {}, "points"))
+        if member_shells:
+            _distribute(case_data)
+        if degree is not None:
+            _join(case_data, "mesh", {"degree": degree})
+        if symmetry or shell.user_mesh:
+            case_data["symmetry"] = symmetry or "none"
+        return (
+            Case.from_source(Source(NAME, case_data, files=shell.files))
+            .with_terms(own_terms)
+            .problem()
+        )
 
 
 def _shell_data(shell: Shell, several: Sequence[Shell]) -> Keys:

@@ -109,7 +109,7 @@ def number_of_amount(
 
 
 def trace(  # noqa: PLR0913
-    scene: Scene,
+    scene: Scene | Record,
     name: str,
     start: Record | State | None = None,
     *,
@@ -129,11 +129,14 @@ def trace(  # noqa: PLR0913
 
     Parameters
     ----------
+    scene
+        The model; or a record of it, from which the path starts.
     name
         The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "load", that of the field, or
         that of a user-defined term.
     start
-        A record or a state; by default the undeformed shell with all amplitudes zero.
+        A record or a state, also of another model with as many unknowns and the same amplitudes; by
+        default the undeformed shell with all amplitudes zero.
     control
         "load": prescribe the amplitude; "conjugate": prescribe the conjugate displacement -Pi_i(u)
         (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes
@@ -161,6 +164,10 @@ def trace(  # noqa: PLR0913
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
+    if isinstance(scene, Record):
+        if scene.scene is None:
+            raise ValueError("trace: this record comes from another process: give a model as well")
+        scene, start = scene.scene, start or scene
     scene.read_functions()
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)
@@ -199,7 +206,9 @@ def trace(  # noqa: PLR0913
     records_of_path = follow_path(load_stage(scene), path, first_point, goal)
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _with_reached(
-        (replace(record, shown=scene.displacement) for record in records), name, targets
+        (replace(record, shown=scene.displacement, scene=scene) for record in records),
+        name,
+        targets,
     )
 
 

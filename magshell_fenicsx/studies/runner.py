@@ -6,13 +6,18 @@ an interrupted study goes on. A task is a point, or several that belong together
 line.
 """
 
+import itertools
+import os
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from typing import TypeVar
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Generic, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -27,6 +32,9 @@ Say = Callable[[str], None]
 Task = TypeVar("Task")
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
 SECONDS_BETWEEN_LINES = terminal.STATUS_SECONDS  # s
+# tasks go to an executor in so many batches: a process begins a batch with what the one before it
+# has found, and a batch is what is lost if it ends
+MAX_BATCHES = 16
 
 
 def _are_of_part(first: str, number: str, count: int) -> bool:
@@ -69,8 +77,9 @@ def compute(
     do: Callable[[Task], Iterable[str]],
     comm: MPI.Intracomm,
     say: Say = lambda line: None,
+    executor: Executor | None = None,
 ) -> None:
-    """Compute tasks, each on the next free rank; collective.
+    """Compute tasks, each on the next free rank, or in the processes of an executor; collective.
 
     An error on one of several ranks ends all ranks.
 
@@ -78,9 +87,16 @@ def compute(
     ----------
     do
         Called with a task, on one rank. It computes the task, keeps the outcome of each of its
-        runs, and yields a line of text for each.
+        runs, and yields a line of text for each. For an executor it can be pickled, as the tasks.
     say
         Called with each line and the remaining time, on the rank of the task.
+    executor
+        Processes of another kind than ranks; see `concurrent.futures`.
+
+    Raises
+    ------
+    CaseError
+        If there are an executor and several ranks.
     """
     start_time, done_count = time.perf_counter(), 0
 
@@ -94,15 +110,92 @@ def compute(
 
     # `progress` says lines, and after a long silence that the work goes on
     with _wait_for_all(comm), reporting_progress(comm, say, remaining_text) as progress:
+        if executor:
+            for line in _lines_of_executor(tasks, do, comm, executor):
+                done_count += 1
+                progress(line + remaining_text())
+            return
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
                 done_count = i + 1  # on all ranks together, since tasks are dealt in order
                 progress(line + remaining_text())
 
 
+def _lines_of_executor(
+    tasks: Sequence[Task],
+    do: Callable[[Task], Iterable[str]],
+    comm: MPI.Intracomm,
+    executor: Executor,
+) -> Iterator[str]:
+    """Compute tasks in the processes of an executor; yield the lines of text as they come."""
+    if comm.size > 1:
+        raise CaseError("jobs: take either ranks of mpirun or the processes of an executor")
+    batch_count = min(MAX_BATCHES, len(tasks))
+    bounds = [i * len(tasks) // max(batch_count, 1) for i in range(batch_count + 1)]
+    batches = [tasks[begin:end] for begin, end in itertools.pairwise(bounds)]
+    futures = [executor.submit(_lines_of_batch, batch, do) for batch in batches]
+    try:
+        for future in as_completed(futures):
+            yield from future.result()
+    finally:  # those that have not begun, after an error or an interrupt
+        for future in futures:
+            future.cancel()
+
+
+def _lines_of_batch(tasks: Sequence[Task], do: Callable[[Task], Iterable[str]]) -> list[str]:
+    """Compute tasks one after the other in this process, and return their lines of text."""
+    return [line for task in tasks for line in do(task)]
+
+
+@contextmanager
+def local_processes(count: int) -> Iterator[Executor | None]:
+    """Yield an executor with new processes of one thread each; None for one process."""
+    if count == 1:
+        yield None
+        return
+    threads_before = os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = threads_before or "1"  # as processes begin with it
+    try:
+        # not by fork: the processes of MPI cannot be copied
+        with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as executor:
+            yield executor
+    finally:
+        if threads_before is None:
+            del os.environ["OMP_NUM_THREADS"]
+
+
 def say_on_first_rank(say: Say, comm: MPI.Comm) -> Say:
     """Return `say` on rank 0, and a function that says nothing on other ranks."""
     return say if comm.rank == 0 else lambda line: None
+
+
+@dataclass(frozen=True)
+class PointRunner(Generic[PointType, OutcomeType]):
+    """Computes a point and keeps its outcome; it can be pickled if its attributes can.
+
+    Attributes
+    ----------
+    compute_point
+        Returns the outcome of a point.
+    store
+        Keeps outcomes.
+    words
+        Returns an outcome in words.
+    numbers
+        Key of a point -> its number, from 1.
+    """
+
+    compute_point: Callable[[PointType], OutcomeType]
+    store: OutcomeStore[OutcomeType]
+    words: Callable[[OutcomeType], str]
+    numbers: Mapping[str, int]
+
+    def __call__(self, point: PointType) -> Iterator[str]:
+        """Compute a point on this rank, keep its outcome, and yield a line of text."""
+        outcome = self.compute_point(point)
+        self.store.keep(point.key, outcome, point.case)
+        number, count = self.numbers[point.key], len(self.numbers)
+        yield f"{number:5d}/{count}  {point.label}: {self.words(outcome)}"
 
 
 def compute_points(
@@ -112,6 +205,7 @@ def compute_points(
     comm: MPI.Intracomm,
     say: Say,
     words: Callable[[OutcomeType], str] = str,
+    executor: Executor | None = None,
 ) -> None:
     """Compute points, each on the next free rank, and keep their outcomes; collective.
 
@@ -125,16 +219,11 @@ def compute_points(
         Called with a line for each point, on the rank that computed it.
     words
         Returns an outcome in words, for this line.
+    executor
+        Processes of another kind than ranks; all that it gets must be picklable.
     """
     numbers = {point.key: number for number, point in enumerate(points, 1)}
-
-    def point_computed(point: PointType) -> Iterator[str]:
-        """Compute a point on this rank, keep its outcome, and yield a line of text."""
-        outcome = compute_point(point)
-        store.keep(point.key, outcome, point.case)
-        yield f"{numbers[point.key]:5d}/{len(points)}  {point.label}: {words(outcome)}"
-
-    compute(points, point_computed, comm, say)
+    compute(points, PointRunner(compute_point, store, words, numbers), comm, say, executor)
 
 
 class ProgressReporter:

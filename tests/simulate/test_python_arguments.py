@@ -1,14 +1,20 @@
 """What programs give to the package: paths in place of cases, numbers with units, and mistakes."""
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_origin, get_type_hints
 
 import pytest
 from conftest import CASES
+from pydantic import BaseModel
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.python_keys import FieldKeys, ForceKeys, PressureKeys
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
@@ -120,3 +126,51 @@ def test_curves_of_nothing(plain: ms.Scene) -> None:
     ):
         ms.curve(plain, records, "lambda")
     assert ms.curve(plain, records).axes
+
+
+def test_parts_are_classes() -> None:
+    """`isinstance` tells what an object is, and the text of a part is the call that made it."""
+    assert isinstance(ms.Case.load(FILE).problem(), ms.Problem)
+    assert not isinstance(ms.Case.load(FILE), ms.Problem)
+    force = ms.Force("tip", depth="1 mm")
+    assert isinstance(force, ms.Force)
+    assert isinstance(force, ms.Step)
+    assert repr(ms.Clamped("rim")) == "Clamped('rim')"
+
+
+@pytest.mark.parametrize(
+    ("keys", "section"),
+    [(PressureKeys, STEPS["pressure"]), (ForceKeys, STEPS["indentation"])],
+)
+def test_keys_of_loads_are_those_of_a_case(keys: type, section: type[BaseModel]) -> None:
+    """The keys that editors know are those that a case has."""
+    assert {*keys.__annotations__} == {*section.model_fields} - {"kind", "at"}
+    for name, annotation in get_type_hints(keys).items():
+        if get_origin(annotation) is Literal:
+            assert annotation == section.model_fields[name].annotation or name == "then"
+
+
+def test_keys_of_a_field_are_those_of_a_case() -> None:
+    known_otherwise = {"remanent", "applied", "lambda_m"}
+    assert {*FieldKeys.__annotations__} == {*MagneticSection.model_fields} - known_otherwise
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ms.Force("tip"), 'Force: tip: where does it end? give depth, such as "2 mm"'),
+        (lambda: ms.Clamped(2), "2: is no name: name the tag in ms.Shell"),  # type: ignore[arg-type]
+        (
+            lambda: ms.Shell(
+                "hemisphere",
+                radius_to_thickness=90,
+                poisson_ratio=0.5,
+                thickness_factor=lambda x: 1 + x[0],
+            ).section(),
+            "shell.thickness_factor: is a function of Python: give a formula",
+        ),
+    ],
+)
+def test_messages_say_what_to_write(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ms.CaseError, match=re.escape(message)):
+        make()

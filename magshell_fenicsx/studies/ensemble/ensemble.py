@@ -13,7 +13,9 @@ with its solver; a record is a point of its path. A part is what one of several 
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +93,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     resume: bool = False,
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
+    executor: Executor | None = None,
 ) -> Ensemble:
     """Compute random samples of a case; collective, and every rank computes samples of its own.
 
@@ -119,6 +122,8 @@ def ensemble(  # noqa: PLR0913 - what a user gives
         Require that the folder has samples of this ensemble.
     say
         Called with one line per finished sample, on the rank that finished it.
+    executor
+        Processes of another kind than ranks, which see the same files; see `concurrent.futures`.
 
     Raises
     ------
@@ -158,7 +163,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
         access_disk(comm, lambda: _copy(samples_by_key, part_stores, store))
         _say_at_begin(len(samples_by_key), 0, comm, say)
     else:
-        _compute_missing(samples_by_key, scalar, store, comm, say)
+        _compute_missing(samples_by_key, scalar, store, comm, say, executor)
     rows = [_row(sample_variants, store, scalar) for sample_variants in zip(*variants, strict=True)]
     content = {
         "case": name,
@@ -181,6 +186,7 @@ def _compute_missing(
     store: OutcomeStore[Outcome],
     comm: MPI.Intracomm,
     say: Say,
+    executor: Executor | None = None,
 ) -> None:
     """Compute the samples whose outcome is not in the store; collective, each rank has its own.
 
@@ -192,14 +198,14 @@ def _compute_missing(
         lambda outcome: outcome.serves(scalar) and not outcome.is_error,
     )
     _say_at_begin(len(samples_by_key), len(missing), comm, say)
-    folds = KnownFolds()
     compute_points(
         missing,
-        lambda sample: solve(sample, scalar, folds),
+        partial(solve, scalar=scalar, folds=KnownFolds()),
         store,
         comm,
         say,
-        words=lambda outcome: _words(outcome, scalar),
+        words=partial(_words, scalar=scalar),
+        executor=executor,
     )
 
 

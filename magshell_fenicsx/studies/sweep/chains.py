@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 from mpi4py import MPI
 
@@ -148,6 +149,10 @@ class SweepCache:
         default_factory=partial(SceneCache, MPI.COMM_SELF, max_unknowns=MOST_UNKNOWNS)
     )
     first: Continuation | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes an empty cache in another process: scenes belong to theirs."""
+        return type(self), (self.columns,)
 
 
 def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[SweepPoint, Outcome]]:

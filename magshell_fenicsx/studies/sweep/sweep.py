@@ -11,6 +11,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,7 @@ def sweep(  # noqa: PLR0913 - what a user gives
     result: str | None = None,
     full_paths: bool = False,
     part: str | None = None,
+    executor: Executor | None = None,
 ) -> Sweep:
     """Run a case at all points of a product of axes; collective, and every rank works.
 
@@ -129,6 +131,8 @@ def sweep(  # noqa: PLR0913 - what a user gives
     part
         "i/n": compute only the i-th of n equal shares of the points; several jobs may share one
         folder. None: compute all.
+    executor
+        Processes of another kind than ranks, which see the same files; see `concurrent.futures`.
 
     Returns
     -------
@@ -167,17 +171,14 @@ def sweep(  # noqa: PLR0913 - what a user gives
                 f"{known_count} of these computed again: their files are of other sources of "
                 "magshell_fenicsx, or damaged"
             )
-    cache = SweepCache(columns=COLUMNS if scalar else CURVE)
-    numbers = {point.key: number for number, point in enumerate(missing, 1)}
-
-    def chain_computed(chain: Chain) -> Iterator[str]:
-        """Compute a chain on this rank, keep each outcome, and yield a line of text for each."""
-        for point, outcome in run_chain(chain, cache):
-            store.keep(point.key, outcome, point.case)
-            place = f"{numbers[point.key]:4d}/{len(missing)}"
-            yield f"{place}  {point.label}: {_words(outcome, scalar)}, {outcome.wall_s:.1f} s"
-
-    compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
+    run = _ChainRunner(
+        store,
+        scalar,
+        {point.key: number for number, point in enumerate(missing, 1)},
+        SweepCache(columns=COLUMNS if scalar else CURVE),
+    )
+    chains = make_chains(axes, points, missing, full_paths=full_paths)
+    compute(chains, run, comm, say, executor)
     outcomes_of_points = [
         (point, outcome) for point in points if (outcome := store.outcome(point.key))
     ]
@@ -190,6 +191,35 @@ def sweep(  # noqa: PLR0913 - what a user gives
     if outcomes_of_points:
         access_disk(comm, lambda: _write(axes, outcomes_of_points, scalar, folder))
     return _sweep_of(axes, own_points, outcomes_of_points, scalar)
+
+
+@dataclass(frozen=True)
+class _ChainRunner:
+    """Computes chains of points, and keeps their outcomes.
+
+    Attributes
+    ----------
+    store
+        Keeps outcomes.
+    scalar
+        The requested number; None without.
+    numbers
+        Key of a point -> its number, from 1.
+    cache
+        Scenes and folds of this process.
+    """
+
+    store: OutcomeStore[Outcome]
+    scalar: Scalar | None
+    numbers: Mapping[str, int]
+    cache: SweepCache
+
+    def __call__(self, chain: Chain) -> Iterator[str]:
+        """Compute a chain on this rank, keep each outcome, and yield a line of text for each."""
+        for point, outcome in run_chain(chain, self.cache):
+            self.store.keep(point.key, outcome, point.case)
+            place = f"{self.numbers[point.key]:4d}/{len(self.numbers)}"
+            yield f"{place}  {point.label}: {_words(outcome, self.scalar)}, {outcome.wall_s:.1f} s"
 
 
 def _line_at_begin(
