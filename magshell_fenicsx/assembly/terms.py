@@ -16,6 +16,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from ufl.form import BaseForm
 
 from magshell_fenicsx.assembly.kernels import DerivedForm, KernelLog, underived
 from magshell_fenicsx.assembly.memo import PointField
@@ -77,7 +78,8 @@ class FormTerm:
     name
         Name of the term.
     energy
-        The form of Pi(u).
+        The form of Pi(u), or a function that returns it: terms that are evaluated at points need no
+        form, and to write one takes long.
     u
         The displacement in the form.
     log
@@ -101,15 +103,15 @@ class FormTerm:
         The skew part that the symmetric tangent lacks; None for a potential.
 
     The private field `_factor` is a constant in all forms but that of the energy; it is set before
-    each assembly. `_u` is the displacement, `_work` the virtual work or None. `_requested_energy`,
-    `_requested_residual` and `_requested_tangent` return the compiled forms; to read them requests
-    the compilation.
+    each assembly. `_energy`, `_u` and `_work` are arguments of the constructor. To read
+    `_requested_energy`, `_requested_residual` and `_requested_tangent` requests the compilation;
+    they return the compiled forms.
     """
 
     def __init__(
         self,
         name: str,
-        energy: ufl.Form,
+        energy: ufl.Form | Callable[[], ufl.Form],
         u: fem.Function,
         log: KernelLog,
         amplitude: str | None = None,
@@ -123,7 +125,11 @@ class FormTerm:
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
-        self.form, self._work = energy, work
+        self._energy, self._work = energy, work
+
+    @cached_property
+    def form(self) -> ufl.Form:
+        return self._energy if isinstance(self._energy, BaseForm) else self._energy()
 
     @cached_property
     def _gradient(self) -> ufl.Form:
@@ -310,7 +316,7 @@ class DensityTerm(FormTerm, Generic[Density]):
         self,
         name: str,
         density: Density,
-        energy: ufl.Form,
+        energy: ufl.Form | Callable[[], ufl.Form],
         u: fem.Function,
         log: KernelLog,
         amplitude: str | None = None,

@@ -421,8 +421,8 @@ def fold_by_one_step(
 ) -> tuple[State, Vector, int]:
     """Return the fold near a good guess by one factorisation. Collective.
 
-    After one step of Newton's method the amplitude is corrected, so that v . R = 0 with the null
-    vector v there. What the step has left of the error of u changes it in second order alone.
+    After one step of Newton's method the amplitude is corrected, so that v . R = 0 with v, nearly
+    the null vector. What the step has left of the error of u changes it in second order alone.
 
     Parameters
     ----------
@@ -431,7 +431,7 @@ def fold_by_one_step(
 
     Returns
     -------
-    The state, its null vector, and the number of other unstable directions at the guess.
+    The state, nearly its null vector, and the number of other unstable directions at the guess.
 
     Raises
     ------
@@ -446,8 +446,7 @@ def fold_by_one_step(
         raise FoldLost("the tangent is singular in more than one direction") from None
     if not max_abs(system.comm, du) <= MAX_STEP * system.length:
         raise FoldLost("Newton's method diverged on its way to a fold")
-    fold_state = state.with_(state.u + du, name, state.mu[name] + dmu)
-    v = tangent.null_vector_at(state, fold_state)
+    fold_state, v = state.with_(state.u + du, name, state.mu[name] + dmu), tangent.v
     load = system.load(fold_state.u, fold_state.mu, name)
     residual_along_v = dot(system.comm, v, system.residual(fold_state.u, fold_state.mu))
     correction = -residual_along_v / dot(system.comm, v, load)
@@ -540,10 +539,11 @@ def _newton_step(
     """
     comm, u, v = system.comm, state.u, tangent.v
     # responses w orthogonal to b; t b are the parts that K cannot balance
-    w_R, t_R = tangent.solve(system.residual(u, state.mu))
+    residual = system.residual(u, state.mu)
+    w_R, t_R = tangent.solve(residual)
     w_mu, t_mu = tangent.solve(system.load(u, state.mu, name))
     # Pi'''(v, v, .), then (dK/dmu) v as the derivative of R_mu along v
-    cubic = third_derivative(system, state, v)
+    cubic = third_derivative(system, state, v, residual)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     # the derivative of g along (du, dmu) = (-w_mu, 1)
     g_mu = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)

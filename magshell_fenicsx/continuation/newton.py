@@ -191,6 +191,17 @@ class BorderedNewton:
         )
         return second_result if second_result.converged else result
 
+    def solve_roughly(
+        self, guess: State, name: str, row: ConstraintRow, fraction: float
+    ) -> NewtonResult:
+        """Find the equilibrium near a good guess, to a fraction of the error of the guess.
+
+        If full steps fail, it is found as by `solve`. Collective.
+        """
+        options = SolveOptions(relative_tolerance=fraction)
+        result = self._run_snes(self._full_steps, guess, name, row, options)
+        return result if result.converged else self.solve(guess, name, row)
+
     def _solve_by_stiffening(
         self, guess: State, name: str, row: ConstraintRow
     ) -> NewtonResult | None:

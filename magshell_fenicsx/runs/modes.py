@@ -435,7 +435,7 @@ def add_frequency_errors(
         return
     estimates, errors = result.error_estimates, dict[str, float]()
     with estimates.naming("frequencies"):
-        errors = frequency_errors(scene, result.last_record, modes)
+        errors = frequency_errors(scene, result.last_record, modes, result.fine_scenes)
     estimates.errors |= errors
     for number, mode in enumerate(modes, 1):
         frequency = hertz(mode.eigenvalue, time_unit)
@@ -467,7 +467,11 @@ def _write_frequencies(
         number: symmetric_wave(whole_shell.model) for number, whole_shell in whole_shells.items()
     }
     content = frequency_table(
-        result.frequencies, symmetric_waves, time_unit, result.contact_changes
+        result.frequencies,
+        symmetric_waves,
+        time_unit,
+        result.contact_changes,
+        {result.end: result.errors},
     )
     access_disk(comm, partial(write_whole, folder / NAME, content))
     # the first and the last point, if they have frequencies

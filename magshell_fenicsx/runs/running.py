@@ -46,7 +46,11 @@ from magshell_fenicsx.runs.rows import RowMaker, imbalances, motion_errors
 from magshell_fenicsx.runs.status import RunProgress, status_line
 from magshell_fenicsx.runs.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.ending import NoResult
-from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates
+from magshell_fenicsx.simulate.discretisation_error import (
+    ErrorEstimates,
+    FineScenes,
+    NotEstimated,
+)
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
@@ -458,9 +462,10 @@ def _write_results(
         if not interruption:
             progress.doing("errors by one degree more")
             _estimate_errors(result, output)
+            estimates = result.error_estimates  # pictures read them from the summary
+            files.write_summary(summary(result, estimates, time.perf_counter() - output.start))
             progress.doing("modes and pictures")
             _write_after_run(result, folder, output.comm, output.say, pictures)
-            estimates = result.error_estimates
             files.write_summary(summary(result, estimates, time.perf_counter() - output.start))
         access_disk(output.comm, partial(write_report, folder, playable=pictures))
     except DiskError as e:
@@ -472,11 +477,21 @@ def _write_results(
 def _estimate_errors(result: Result, output: RunOutput) -> None:
     """Estimate the errors of the results, and print warnings about them; collective.
 
-    A run that has been asked to stop, or is at its time limit, has no estimates.
+    A run that has been asked to stop, or is at its time limit, has no estimates, or no further
+    ones.
     """
+
+    def check() -> None:
+        """Raise `NotEstimated` if the run has been asked to stop."""
+        try:
+            output.watch.check()
+        except Interrupted as e:
+            raise NotEstimated(str(e)) from None
+
+    result.fine_scenes = FineScenes(check)
     try:
-        output.watch.check()
-    except Interrupted as e:
+        check()
+    except NotEstimated as e:
         result.error_estimates = ErrorEstimates(reasons={"all": str(e)})
         return
     for name, error in result.large_errors.items():
@@ -542,6 +557,7 @@ def _write_after_run(
     with result.output:
         modes_after(result, folder, say)
         frequencies_after(result, folder, say)
+        result.fine_scenes.clear()  # nothing else is compared
         if result.scene.problem.gradients is not None:
             from magshell_fenicsx.runs.gradients import gradients_after
 

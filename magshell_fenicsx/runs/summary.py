@@ -32,7 +32,11 @@ from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
 from magshell_fenicsx.shells.modes import ShellMode
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
-from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates, estimate_errors
+from magshell_fenicsx.simulate.discretisation_error import (
+    ErrorEstimates,
+    FineScenes,
+    estimate_errors,
+)
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -184,6 +188,8 @@ class Result:
     scenes_of_rows
         Row number -> scene, of the rows whose scene is not `scene`, as on a branch that its model
         excludes.
+    fine_scenes
+        The scenes by which errors are estimated, as long as they are needed.
     """
 
     scene: Scene
@@ -208,6 +214,7 @@ class Result:
     mode_places: dict[int, list[float]] = field(default_factory=dict)
     last_record: Record | None = None
     scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
+    fine_scenes: FineScenes = field(default_factory=FineScenes)
 
     def __repr__(self) -> str:
         """Return the result in a few lines: how it ended, and its instabilities."""
@@ -230,7 +237,11 @@ class Result:
         The first access is collective, and solves with one degree more on the same mesh.
         """
         has_stopped = bool(self.stopped)
-        estimates = estimate_errors(self.scene, self.path_history, has_stopped=has_stopped)
+        estimates = estimate_errors(
+            self.scene, self.path_history, self.fine_scenes, has_stopped=has_stopped
+        )
+        if self.scene.problem.frequencies is None:  # nothing else is compared
+            self.fine_scenes.clear()
         errors, with_units = estimates.errors, in_units(self)
         # the same errors of results in units
         for name, number in self._main_results.items():

@@ -146,10 +146,15 @@ class EnergyFactory:
         one, a `MomentTerm` for a moment on an edge.
         """
         # the modelled part's energy over the domain's: 2 pi for a meridian
-        factor, u = self.domain.revolution_factor, self.domain.jet(self.u)
-        form, work = factor * energy.form_of(u), None
+        domain, work = self.domain, None
+        factor = domain.revolution_factor
         if energy.work:  # a load without potential
-            work = factor * energy.work(u, self.domain.jet(ufl.TestFunction(self.u.function_space)))
+            jets = domain.jet(self.u), domain.jet(ufl.TestFunction(self.u.function_space))
+            work = factor * energy.work(*jets)
+
+        def form() -> ufl.Form:
+            """Return the form at the displacement of the model, which takes long to write."""
+            return factor * energy.form_of(domain.jet(self.u))
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
             """Return a term of a class, whose constructor takes a density or none."""

@@ -18,7 +18,7 @@ Words and symbols:
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -61,10 +61,14 @@ from magshell_fenicsx.simulate.stage import Stage, load_stage
 from magshell_fenicsx.simulate.steps import stage_of_step
 
 MAX_LOAD_CHANGE = 0.5  # over the load: an instability farther away is another one
+SOLVER_ERROR = 1e-4  # of Newton's method, over the change by one degree more
 SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue along the path
 ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
+LATER = "limit_load_"  # before the number of an instability after the first
+LATER_TAKE_LONG = "this and later instabilities have no estimate, as it would take long"
+MOST_INSTABILITIES = 4  # of a path on a meridian, whose errors are estimated
 OTHERS_FIRST = (
     "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
     "too coarse"
@@ -87,12 +91,13 @@ class ErrorEstimates:
     ----------
     errors
         Name of a result -> its estimated absolute error. Names: "knockdown", "critical_field",
-        "limit_load" (the first value of `limit_points` in summary.json) and "barrier"; at the last
-        point COLUMN@end of columns of path.csv, and "omega2_1", "omega2_2" and so on.
+        "limit_load" (the first value of `limit_points` in summary.json), "limit_load_2" and so on
+        for later ones that are not on a branch, and "barrier"; at the last point COLUMN@end of
+        columns of path.csv, and "omega2_1", "omega2_2" and so on.
     reasons
         Name of a result, "end" for all at the last point -> why it has no estimate.
     too_coarse
-        Those of these names for which the mesh may be too coarse.
+        Those of these names for which the mesh may be too coarse, without later instabilities.
     """
 
     errors: dict[str, float] = field(default_factory=dict)
@@ -106,12 +111,59 @@ class ErrorEstimates:
             yield
         except NotEstimated as e:
             self.reasons |= dict.fromkeys(names, str(e))
-            self.too_coarse += names if isinstance(e, TooCoarse) else ()
+            if isinstance(e, TooCoarse):
+                self.too_coarse += [name for name in names if not name.startswith(LATER)]
         except Exception as e:  # whatever it is: the run has its results, and the summary names it
             self.reasons |= dict.fromkeys(names, f"{type(e).__name__}: {e}".rstrip(": "))
 
 
-def estimate_errors(scene: Scene, history: History, *, has_stopped: bool = False) -> ErrorEstimates:
+class FineScenes:
+    """Fine scenes of the scenes of a run, and the comparisons at its records, each made once.
+
+    Parameters
+    ----------
+    check
+        Called before each of them, on all ranks; it raises `NotEstimated` to end the estimate.
+    """
+
+    def __init__(self, check: Callable[[], None] = lambda: None) -> None:
+        self._check = check
+        self._scenes = dict[int, Scene]()
+        self._comparisons = dict[int, DegreeComparison]()
+
+    def comparison(
+        self, first_scene: Scene, record: Record, *, is_later: bool = False
+    ) -> "DegreeComparison":
+        """Return the comparison at a record, whose state is computed; collective.
+
+        `is_later` tells that the record is an instability after another one.
+
+        Raises
+        ------
+        NotEstimated, CaseError, MeshError
+            If there is none; and other errors if the state is not found.
+        """
+        if id(record) not in self._comparisons:
+            scene = record.scene or first_scene
+            _refuse(scene, record)
+            self._check()
+            if id(scene) not in self._scenes:
+                self._scenes[id(scene)] = fine_scene(scene)
+                self._check()
+            comparison = DegreeComparison(scene, self._scenes[id(scene)], record, is_later)
+            _ = comparison.state
+            self._comparisons[id(record)] = comparison
+        return self._comparisons[id(record)]
+
+    def clear(self) -> None:
+        """Let go of all scenes and comparisons, which take memory."""
+        self._scenes.clear()
+        self._comparisons.clear()
+
+
+def estimate_errors(
+    scene: Scene, history: History, fine_scenes: FineScenes, *, has_stopped: bool = False
+) -> ErrorEstimates:
     """Return the estimated errors of the results of a run; collective.
 
     Parameters
@@ -120,33 +172,40 @@ def estimate_errors(scene: Scene, history: History, *, has_stopped: bool = False
         The first scene of the run.
     history
         The records of the run.
+    fine_scenes
+        Scenes with one degree more, to which those of the run are added.
     has_stopped
         Whether the run stopped before its end: then only instabilities are results.
     """
-    estimates, fine_scenes = ErrorEstimates(), _FineScenes()
+    estimates, end = ErrorEstimates(), history.end
+
+    def comparison(record: Record) -> DegreeComparison:
+        """Return the comparison at a record."""
+        is_later = record.label in LOCATED and record is not history.located[0]
+        return fine_scenes.comparison(scene, record, is_later=is_later)
+
     for record, columns in _instabilities(scene, history):
         with estimates.naming(*columns):
-            changes = fine_scenes.comparison(scene, record).changes
+            changes = comparison(record).changes
             estimates.errors |= {
                 name: _estimated(changes.get(column, 0.0), record.point.load_error)
                 for name, column in columns.items()
             }
+    if len(history.located) > (count := _estimated_count(scene)):
+        estimates.reasons[f"{LATER}{count + 1}"] = LATER_TAKE_LONG
     if has_stopped:
         estimates.reasons["end"] = "the run stopped early"
         return estimates
-    end = history.end
     if end and end.amplitude:
         with estimates.naming("end"):
-            changes = fine_scenes.comparison(scene, end).changes
+            changes = comparison(end).changes
             estimates.errors |= {
                 f"{column}@end": _estimated(change) for column, change in changes.items() if change
             }
     steps = scene.problem.programme
     if steps and steps[-1].until == "zero" and history.begin and history.last:
         with estimates.naming("barrier"):
-            begin, last = (
-                fine_scenes.comparison(scene, record) for record in (history.begin, history.last)
-            )
+            begin, last = (comparison(record) for record in (history.begin, history.last))
             if begin.fine is not last.fine:
                 raise NotEstimated("the step begins in another model")
             change = last.barrier_from(begin)
@@ -154,7 +213,9 @@ def estimate_errors(scene: Scene, history: History, *, has_stopped: bool = False
     return estimates
 
 
-def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -> dict[str, float]:
+def frequency_errors(
+    scene: Scene, record: Record, modes: Sequence[ShellMode], fine_scenes: FineScenes
+) -> dict[str, float]:
     """Return name -> estimated error of the natural modes at a record, "omega2_1", ...; collective.
 
     A mode is compared with the mode of the same label and rank.
@@ -165,16 +226,17 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
         Scene of the record.
     modes
         Natural modes there, in ascending order.
+    fine_scenes
+        Scenes with one degree more, to which that of the record is added.
 
     Raises
     ------
     NotEstimated
         If they cannot be compared; and other errors if the state or the modes are not found.
     """
-    _refuse(scene, record)
     if scene.model.contacts or scene.model.shell_contacts:
         raise NotEstimated("frequencies depend on the stiffness of contacts")
-    comparison = DegreeComparison(scene, fine_scene(scene), record)
+    comparison = fine_scenes.comparison(scene, record)
     space = mode_space(comparison.fine.model)
     fine_modes = ShellModes(space.model).vibrations(
         space.state(comparison.state),
@@ -193,11 +255,20 @@ def frequency_errors(scene: Scene, record: Record, modes: Sequence[ShellMode]) -
 
 def _estimated(change: float, load_error: float = 0.0) -> float:
     """Return the error of a number that one degree more changes, with that of the solver."""
-    return SAFETY * abs(change) + load_error
+    return float(SAFETY * abs(change) + load_error)
+
+
+def _estimated_count(scene: Scene) -> int:
+    """Return of how many instabilities errors are estimated; on a meridian that is quick."""
+    return MOST_INSTABILITIES if scene.problem.axisymmetric else 1
 
 
 def _instabilities(scene: Scene, history: History) -> list[tuple[Record, dict[str, str]]]:
-    """Return the instabilities that are results, each with name of the result -> its column."""
+    """Return instabilities of a path, each with name of the result -> its column.
+
+    They are those that are results, and the first ones of the path. All but the very first have the
+    name `LATER` with their number.
+    """
     columns_of = dict[int, dict[str, str]]()
     steps_with_held_conjugate = {
         step.number for step in scene.problem.programme if step.name in step.load.hold
@@ -211,31 +282,10 @@ def _instabilities(scene: Scene, history: History) -> list[tuple[Record, dict[st
                 column = amplitude(record.amplitude).column
                 columns_of.setdefault(number, {})[name] = column
                 break
-    return [(history.located[number], columns) for number, columns in columns_of.items()]
-
-
-class _FineScenes:
-    """Fine scenes of the scenes of a run, and the comparisons at its records, each made once."""
-
-    def __init__(self) -> None:
-        self._scenes = dict[int, Scene]()
-        self._comparisons = dict[int, DegreeComparison]()
-
-    def comparison(self, first_scene: Scene, record: Record) -> "DegreeComparison":
-        """Return the comparison at a record; collective.
-
-        Raises
-        ------
-        NotEstimated, CaseError, MeshError
-            If there is none.
-        """
-        if id(record) not in self._comparisons:
-            scene = record.scene or first_scene
-            _refuse(scene, record)
-            if id(scene) not in self._scenes:
-                self._scenes[id(scene)] = fine_scene(scene)
-            self._comparisons[id(record)] = DegreeComparison(scene, self._scenes[id(scene)], record)
-        return self._comparisons[id(record)]
+    for number, record in enumerate(history.located[1 : _estimated_count(scene)], 1):
+        column = amplitude(record.amplitude).column
+        columns_of.setdefault(number, {})[f"{LATER}{number + 1}"] = column
+    return [(history.located[number], columns) for number, columns in sorted(columns_of.items())]
 
 
 def _refuse(scene: Scene, record: Record) -> None:
@@ -311,11 +361,14 @@ class DegreeComparison:
         The scene of the point, and its fine scene.
     record
         The point.
+    is_later
+        Whether it is an instability after another one.
     """
 
     scene: Scene
     fine: Scene
     record: Record
+    is_later: bool = False
 
     @cached_property
     def changes(self) -> dict[str, float]:
@@ -396,7 +449,7 @@ class DegreeComparison:
         if by_conjugate:
             held_value = -system.potential(guess.u, guess.mu, name)
             row = PrescribedConjugate(system, name, held_value)
-        outcome = stage.newton.solve(guess, name, row)
+        outcome = stage.newton.solve_roughly(guess, name, row, SOLVER_ERROR)
         if not outcome.converged:
             raise TooCoarse(f"with one degree more: {outcome.reason}")
         return stage, outcome.state, row
@@ -483,7 +536,8 @@ class DegreeComparison:
         NotEstimated
             If there are more.
         """
-        if unstable > unstable_before or unstable_before <= 1 <= unstable:
+        is_other_first = not self.is_later and unstable_before <= 1 <= unstable
+        if unstable > unstable_before or is_other_first:
             raise TooCoarse(OTHERS_FIRST)
 
 

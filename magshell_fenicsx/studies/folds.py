@@ -17,10 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, find_fold, predict_fold
+from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import SceneCache, with_strengths
 from magshell_fenicsx.simulate.transfer import chart, matching, same_mesh, transfer
@@ -293,6 +297,14 @@ class KnownFolds:
             deviation = float(np.std([*known_numbers, value_a])) or 1.0
             total += ((value_a - value_b) / deviation) ** 2
         return total
+
+
+def result_of_fold(scene: Scene, fold: Fold) -> Result:
+    """Return the result of a run whose path has a fold alone, which was found without the path."""
+    point = Point(fold.state, fold.value, fold.phi, 0.0, fold.unstable, fold.unstable)
+    record = Record("fold", fold.name, point, step=len(scene.problem.programme))
+    history = History(located=[record])
+    return Result(scene, fold.state, [fold_row(scene, fold)], path_history=history)
 
 
 def scene_of(case: Case, scenes: SceneCache) -> Scene:

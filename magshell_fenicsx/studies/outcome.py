@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.runs.summary import Result, in_units, snaps
+from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates
 from magshell_fenicsx.studies.results import Scalar
 
 OutcomeOrigin = Literal["path", "fold"]
@@ -52,6 +53,8 @@ class Outcome:
         As in summary.json.
     errors
         Name of a result -> its estimated absolute error, as in summary.json; empty if nobody asked.
+    errors_not_estimated
+        Name of a result -> why it has no estimate, as in summary.json.
     """
 
     knockdown: float | None
@@ -67,6 +70,7 @@ class Outcome:
     in_units: dict[str, float] = field(default_factory=dict)
     snaps: list[dict[str, Any]] = field(default_factory=list)
     errors: dict[str, float] = field(default_factory=dict)
+    errors_not_estimated: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
@@ -92,6 +96,16 @@ class Outcome:
         # rows as texts, as in path.csv
         rows = [_texts_of(row) for row in self.curve]
         return scalar.value_in(summary, rows)
+
+    def error(self, scalar: Scalar) -> float | None:
+        """Return the estimated error of a named number of the run; None without an estimate."""
+        return scalar.error_in(self.errors, [_texts_of(row) for row in self.curve])
+
+    @property
+    def why_not_estimated(self) -> str | None:
+        """Why results have no estimated error; None if all have one."""
+        reasons = (f"{name}: {reason}" for name, reason in self.errors_not_estimated.items())
+        return "; ".join(reasons) or None
 
     def serves(self, scalar: Scalar) -> bool:
         """Return whether the outcome is enough for a number.
@@ -126,7 +140,7 @@ def outcome_of(
     factorisations: int | None = None,
     wall_s: float = 0.0,
     columns: Sequence[str] = COLUMNS,
-    errors: Mapping[str, float] | None = None,
+    estimates: ErrorEstimates | None = None,
 ) -> Outcome:
     """Return the outcome of a run, or of a fold in the form of a run.
 
@@ -138,8 +152,8 @@ def outcome_of(
         Number of factorisations; None for those of the result's own scene.
     columns
         Columns of path.csv that the curve keeps, beside those that the scene adds.
-    errors
-        `Result.errors`, where they are wanted.
+    estimates
+        `Result.error_estimates`, where they are wanted.
     """
     if factorisations is None:
         factorisations = result.scene.newton.factorisation.count
@@ -162,7 +176,8 @@ def outcome_of(
         barrier=result.barrier,
         in_units=in_units(result),
         snaps=snaps(result.rows) if origin == "path" else [],  # a fold alone has no path
-        errors=dict(errors or {}),
+        errors=estimates.errors if estimates else {},
+        errors_not_estimated=estimates.reasons if estimates else {},
     )
 
 

@@ -78,6 +78,26 @@ class Scalar:
             return float(path[-1][self.column])
         return _crossing(path, self.column, self.at, self.value)
 
+    def error_in(
+        self, errors: Mapping[str, float], rows: Sequence[Mapping[str, str]]
+    ) -> float | None:
+        """Return the estimated error of the number; None if it has no estimate.
+
+        A number of the path has one at its last point.
+
+        Parameters
+        ----------
+        errors, rows
+            `errors` of summary.json, and the content of path.csv.
+        """
+        if not self.column:
+            return _number(errors.get(self.name))
+        path = [row for row in rows if row["branch"] == "0"]
+        is_at_end = self.at == "end"
+        if path and self.at in path[-1]:
+            is_at_end = math.isclose(float(path[-1][self.at]), self.value, rel_tol=1e-9)
+        return _number(errors.get(f"{self.column}@end")) if is_at_end else None
+
 
 def parse_scalar(text: str) -> Scalar:
     """Read `--result`, the name of a number of a run.

@@ -3,6 +3,7 @@
 References: refinement 2 and degree 5 of this program, except where another source is named.
 """
 
+import csv
 import json
 from pathlib import Path
 
@@ -14,7 +15,13 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.public import Result, Scene, run
-from magshell_fenicsx.simulate.discretisation_error import fine_scene, with_higher_degree
+from magshell_fenicsx.simulate.discretisation_error import (
+    FineScenes,
+    NotEstimated,
+    estimate_errors,
+    fine_scene,
+    with_higher_degree,
+)
 
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
 POLE = [*COARSE, "loading.depth=2", "loading.points=2"]
@@ -38,6 +45,13 @@ def test_fold_of_a_meridian() -> None:
     check_effectivity(result, "knockdown", result.knockdown, 0.326233289)
     assert result.errors["limit_load"] == result.errors["knockdown"]
     assert not result.error_estimates.reasons
+
+    def stop() -> None:
+        raise NotEstimated("interrupted by SIGTERM")
+
+    stopped = estimate_errors(result.scene, result.path_history, FineScenes(stop))
+    assert not stopped.errors
+    assert stopped.reasons["knockdown"] == "interrupted by SIGTERM"
 
 
 def test_fold_of_half_a_shell() -> None:
@@ -105,6 +119,12 @@ def test_critical_field_and_displacement_beyond_it() -> None:
     field = result.errors["critical_field"] / abs(result.critical_field)
     in_units = result.errors["critical_field_mT"] / 363.17
     assert in_units == pytest.approx(field, rel=1e-3)
+    # later instabilities, by modes that the meridian excludes and by its own
+    references = -0.0115600159, 0.00838612896, 0.0117788327
+    for number, reference in enumerate(references, 2):
+        value = float(result.limit_points[number - 1]["value"])
+        check_effectivity(result, f"limit_load_{number}", value, reference)
+    assert [*result.error_estimates.reasons] == ["limit_load_5"]
 
 
 @pytest.mark.slow
@@ -116,6 +136,10 @@ def test_frequencies(tmp_path: Path) -> None:
     assert "omega2_6" not in result.errors
     relative_error = result.errors["omega2_7"] / modes[6].eigenvalue
     assert result.errors["hertz_7"] / 165.448 == pytest.approx(relative_error / 2, rel=1e-4)
+    with (tmp_path / "out" / "frequencies.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert float(rows[6]["omega2_error"]) == result.errors["omega2_7"]
+    assert rows[5]["omega2_error"] == ""  # a rigid motion
 
 
 def test_what_has_no_estimate_says_why() -> None:

@@ -25,6 +25,7 @@ from ufl import Coefficient
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.memo import PointField
 from magshell_fenicsx.assembly.terms import AngleTerm, DensityTerm
 from magshell_fenicsx.mesh.patch import MeshError, UserField
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -169,6 +170,10 @@ class ShellTerm(DensityTerm[Density]):
     """A term of a shell; its energy comes from points where these are known."""
 
     points: AtPoints | None = None
+
+    @cached_property
+    def _point_fields(self) -> list[PointField]:  # those of the form, which may not be needed
+        return [field for field in self.density.parameters if isinstance(field, PointField)]
 
     def energy(self) -> float:
         return self.points.energy(self.name) if self.points else super().energy()

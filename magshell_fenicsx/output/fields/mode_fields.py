@@ -248,6 +248,7 @@ def gradient_files(folder: Path) -> dict[str, Path]:
 
 NAME = "frequencies.csv"
 NUMBERS = ("point", "wave", "omega2", "hertz")
+ERRORS = ("omega2_error", "hertz_error")  # estimated, at the last point
 # relative change of omega2 if the bodies in contact are four times as stiff
 CONTACT_CHANGE = "contact_change"
 
@@ -300,6 +301,7 @@ def frequency_table(
     symmetric_waves: Mapping[int, str],
     time_unit: float | None,
     contact_changes: Mapping[int, Sequence[float]],
+    errors: Mapping[int, Mapping[str, float]],
 ) -> bytes:
     """Return the content of frequencies.csv: the modes of each point, in their order.
 
@@ -314,17 +316,25 @@ def frequency_table(
     contact_changes
         Number of a point -> for each of its modes the value of the column `CONTACT_CHANGE`. Empty
         without bodies; the table then has no such column.
+    errors
+        Number of a point -> estimated errors, "omega2_1", "hertz_1" and so on, of its modes.
     """
-    lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
+    head = (*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS
+    lines: list[Sequence[Any]] = [(*head, *ERRORS)]
     for point, modes in by_point.items():
         for number, mode in enumerate(modes):
-            row = (
-                point,
-                wave_of(mode.label, symmetric_waves[point]),
-                mode.eigenvalue,
-                hertz(mode.eigenvalue, time_unit),
+            errors_of_point = errors.get(point, {})
+            lines.append(
+                (
+                    point,
+                    wave_of(mode.label, symmetric_waves[point]),
+                    mode.eigenvalue,
+                    hertz(mode.eigenvalue, time_unit),
+                    *([contact_changes[point][number]] if contact_changes else []),
+                    errors_of_point.get(f"omega2_{number + 1}"),
+                    errors_of_point.get(f"hertz_{number + 1}"),
+                )
             )
-            lines.append((*row, contact_changes[point][number]) if contact_changes else row)
     return table_text(lines, end="\n").encode()
 
 

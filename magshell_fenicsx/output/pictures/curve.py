@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.mode_fields import Frequency
 from magshell_fenicsx.output.pictures.captions import write_numbers
+from magshell_fenicsx.output.pictures.error_band import draw_error_band, errors_at_points
 from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMNS, drawing
 from magshell_fenicsx.output.pictures.lines import (
     SEGMENTS_PER_INTERVAL,
@@ -59,7 +60,11 @@ MAX_COVERED = 0.02  # of the points of all curves, that an inset may cover
 
 
 def curve_figure(
-    rows: Sequence[Row], amplitude: str, style: OutputSection, pole: str = POLE
+    rows: Sequence[Row],
+    amplitude: str,
+    style: OutputSection,
+    pole: str = POLE,
+    errors: Mapping[str, float] | None = None,
 ) -> "Figure":
     """Return the figure of the part of a path in which `amplitude` varied, with its branches.
 
@@ -74,6 +79,9 @@ def curve_figure(
         Rows of path.csv.
     pole
         Name of the point of w_pole_over_h without named points.
+    errors
+        Estimated errors by the name of the result, as in summary.json; a band shows them where it
+        is wider than the line.
     """
     steps = worth_drawing(curve_steps(rows, amplitude))
     with drawing(style):
@@ -86,6 +94,7 @@ def curve_figure(
         figure.draw_without_rendering()  # insets need the places of the axes
         for axes, step in zip(list(figure.axes), steps, strict=True):
             draw_hidden(axes, step)
+            draw_error_band(axes, step, errors_at_points(rows, errors or {}))
     return figure
 
 

@@ -45,7 +45,13 @@ from magshell_fenicsx.output.pictures.rendering import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.manifest import refuse_unwritten, write_manifest
-from magshell_fenicsx.output.store.stored_results import case_in, headline, pole_of, style_of
+from magshell_fenicsx.output.store.stored_results import (
+    case_in,
+    headline,
+    pole_of,
+    read_summary,
+    style_of,
+)
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.parts.observables import MapGrid
 from magshell_fenicsx.quantities.registry import field_columns
@@ -100,6 +106,14 @@ class PicturedRun:
     def pole_name(self) -> str:
         """Name of the point of w_pole_over_h."""
         return pole_of(self.resolved)
+
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """Estimated errors of the results; empty for a run that has no summary yet."""
+        if not (self.folder / "summary.json").exists():
+            return {}
+        estimates: Mapping[str, float] = read_summary(self.folder).get("errors", {})
+        return estimates
 
     @cached_property
     def camera(self) -> Camera:
@@ -288,7 +302,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     surface, shell_data = run.surface_at(run.headline)
     # over the load: the curve, and what sensors read
     if amplitude := str(last_row["amplitude"]):
-        curve = curve_figure(run.rows, amplitude, style, run.pole_name)
+        curve = curve_figure(run.rows, amplitude, style, run.pole_name, run.errors)
         if shapes:
             with drawing(style):
                 shells = list[tuple[Row, Surface]]()

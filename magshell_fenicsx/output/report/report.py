@@ -44,7 +44,8 @@ from magshell_fenicsx.quantities.registry import amplitude, shown_quantity
 NAME, TEMPLATE = "report.html", "report_template.html"
 MIN_FOLDED_ROWS = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
-    "curve.png": "Load over displacement; dashed where the shell is unstable.",
+    "curve.png": "Load over displacement; dashed where the shell is unstable. A band is the "
+    "estimated error by the mesh, where it is wider than the line.",
     "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
     "field_maps.png": "The magnetic field beside the shell at the last point: field lines and |B|.",
     "solutions.png": "The end of the path, and the solutions that the search has found.",

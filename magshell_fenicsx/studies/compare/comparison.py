@@ -281,13 +281,14 @@ def _content(
     name, value_of = judge(
         [run for runs_of_model in runs.values() for run in runs_of_model], judged_place, scalar
     )
+    judged_scalar = parse_scalar(name) if name == "knockdown" else scalar
     for model, runs_of_model in runs.items():
         values = [value_of(run) for run in runs_of_model]
         # by Richardson extrapolation; None if it is not known
         limit = extrapolated(values, [run.refinement for run in runs_of_model])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
         data_of_runs[model] = [
-            _data_of_run(run, value, error)
+            _data_of_run(run, judged_scalar, value, error)
             for run, value, error in zip(runs_of_model, values, errors, strict=True)
         ]
         limits[model] = limit
@@ -313,12 +314,27 @@ def _content(
     }
 
 
-def _data_of_run(run: ModelRun, value: float | None, error: float | None) -> dict[str, Any]:
-    """Return a run with its compared number and the relative error of this, as in compare.json."""
+def _data_of_run(
+    run: ModelRun, scalar: Scalar | None, value: float | None, error: float | None
+) -> dict[str, Any]:
+    """Return a run with its compared number and the errors of this, as in compare.json.
+
+    Parameters
+    ----------
+    scalar
+        The number; None for the load at a displacement.
+    error
+        Its relative error from the limit of the model's runs; None if that is not known.
+    """
+    # by the mesh, as the run estimates it
+    value_error = None
+    if scalar:
+        value_error = scalar.error_in(run.summary.get("errors", {}), run.rows)
     return {
         "refinement": run.refinement,
         "dofs": run.dofs,
         "value": value,
+        "value_error": value_error,
         "error": error,
         "cpu_s": run.cpu_s,
         "wall_s": run.wall_s,

@@ -8,7 +8,7 @@ lowest of several instabilities, which may cross; a frequency likewise. A target
 undeformed to wanted places. A scene is the model of a case with its solver.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.discretisation_error import FineScenes, estimate_errors
 from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY, follow_alone
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
 from magshell_fenicsx.simulate.gradients.fields import MASS, mass
@@ -59,6 +60,8 @@ class DesignEvaluation:
     beside
         Result -> values and gradients of the instabilities or frequencies next above the lowest
         one, which is the result.
+    errors
+        Result -> its estimated error by the mesh, where that is known.
     seen
         Further numbers: the largest distance to a wanted shape.
     note
@@ -68,6 +71,7 @@ class DesignEvaluation:
     values: dict[str, float] = field(default_factory=dict)
     gradients: dict[str, list[float]] = field(default_factory=dict)
     beside: dict[str, list[tuple[float, list[float]]]] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
     seen: dict[str, float] = field(default_factory=dict)
     note: str = ""
 
@@ -135,7 +139,20 @@ def evaluate(
     for target in targets.values():
         _, largest_distance = distances(scene, path.records[-1].point.state, target)
         evaluation.seen[DISTANCE] = largest_distance
+    evaluation.errors.update(_estimated_errors(scene, path, evaluation.values))
     return replace(evaluation, note="; ".join(notes))
+
+
+def _estimated_errors(
+    scene: Scene, path: "_ComputedPath", results: Iterable[str]
+) -> dict[str, float]:
+    """Return the estimated errors of results by the mesh, of those that have one; collective."""
+    has_stopped = bool(path.lost_reason)
+    estimates = estimate_errors(scene, path.history, FineScenes(), has_stopped=has_stopped)
+    # a critical load has an error of its name, a column of path.csv one at the end
+    at_end = {result: estimates.errors.get(f"{result}@end") for result in results}
+    errors = {result: estimates.errors.get(result, error) for result, error in at_end.items()}
+    return {result: error for result, error in errors.items() if error is not None}
 
 
 # converts gradients by names of numbers and fields to the gradient (p,) by the variables

@@ -172,6 +172,7 @@ class Design:
         row = {
             "evaluation": len(self.rows) + 1,
             **{result: evaluation.values.get(result) for result in self.goal.results},
+            **{f"{result}_error": evaluation.errors.get(result) for result in self.goal.results},
             **evaluation.seen,
             "objective": self.goal.objective(evaluation) if solved else None,
             "violation": self.goal.violation(evaluation) if solved else None,

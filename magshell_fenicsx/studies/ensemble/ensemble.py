@@ -21,7 +21,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.fold import Fold, FoldGuess, FoldLost, fold_ahead
+from magshell_fenicsx.continuation.fold import FoldGuess, FoldLost, fold_ahead
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole
@@ -29,6 +29,7 @@ from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.quantities.quantity import number_with_error
 from magshell_fenicsx.runs.rows import RowMaker
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
@@ -46,7 +47,7 @@ from magshell_fenicsx.studies.ensemble.statistics import (
     statistics,
     write_samples,
 )
-from magshell_fenicsx.studies.folds import KnownFolds, fold_row, has_knockdown
+from magshell_fenicsx.studies.folds import KnownFolds, has_knockdown, result_of_fold
 from magshell_fenicsx.studies.outcome import FAILED, Outcome, outcome_of
 from magshell_fenicsx.studies.points import MakeCase
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
@@ -219,7 +220,9 @@ def _words(outcome: Outcome, scalar: Scalar) -> str:
     """Return the outcome of a sample in words: the number, why it ended early, and the CPU time."""
     value = outcome.value(scalar)
     outcome_text = (
-        f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
+        f"no {scalar.name}"
+        if value is None
+        else f"{scalar.name} = {number_with_error(value, outcome.error(scalar))} ({outcome.found})"
     )
     reason = f", {outcome.stopped}" if outcome.stopped else ""
     return f"{outcome_text}{reason}, {outcome.cpu_s:.1f} s CPU"
@@ -364,11 +367,13 @@ def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
     # imperfections may be modes of the perfect shell, which are computed first
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
-        return outcome_of(run(problem, comm=MPI.COMM_SELF))
+        result = run(problem, comm=MPI.COMM_SELF)
+        return outcome_of(result, estimates=result.error_estimates)
     scene = Scene(problem, MPI.COMM_SELF)
     try:
         # from the nearest known fold on the same mesh
-        return _outcome_of_fold(scene, folds.follow(sample.values, scene))
+        # without an estimate of its error, which would take as long as the fold
+        return outcome_of(result_of_fold(scene, folds.follow(sample.values, scene)), "fold")
     except FoldLost:
         return _outcome_along_path(sample, scene, folds)
 
@@ -404,14 +409,8 @@ def _outcome_along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outc
                 continue
             # a fold that was found from a stable point must lie ahead on this path
             if record.label == "fold" or fold.value > point.state.mu["pressure"]:
-                return _outcome_of_fold(scene, fold)
+                fold_result = result_of_fold(scene, fold)
+                return outcome_of(fold_result, "fold", estimates=fold_result.error_estimates)
     except Stopped as e:
         result.stopped = str(e)
     return outcome_of(result)
-
-
-def _outcome_of_fold(scene: Scene, fold: Fold) -> Outcome:
-    """Return the outcome of a fold that was found without its whole path."""
-    # in the form of a run whose path has this point alone
-    result = Result(scene, fold.state, [fold_row(scene, fold)])
-    return outcome_of(result, "fold")

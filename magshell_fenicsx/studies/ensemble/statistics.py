@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 Row = dict[str, Any]
 RESULT, WITHOUT = "result", "result_without_weakest"
 SEVEREST = "severest."
-FIRST_COLUMNS = ("sample", "status", RESULT)
+FIRST_COLUMNS = ("sample", "status", RESULT, "result_error")
 LAST_COLUMNS = ("found", "factorisations", "dofs", "cpu_s", "wall_s", "why", "point")
 STATUS = {
     "found": "with a result",
@@ -71,6 +71,7 @@ def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
         "sample": sample.number,
         "status": status,
         RESULT: result,
+        "result_error": outcome.error(scalar) if outcome else None,
         **_columns(sample.values),
         **_columns({f"{SEVEREST}{key}": number for key, number in sample.severest.items()}),
         **{name: getattr(outcome, name, None) for name in computed},

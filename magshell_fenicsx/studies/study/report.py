@@ -107,7 +107,7 @@ def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
 
 REFINEMENT = "mesh.refinement"
 COLUMNS = (
-    *("ranks", "cells", "dofs", "degree", "result", "error"),
+    *("ranks", "cells", "dofs", "degree", "result", "result_error", "error"),
     *(
         "wall_s",
         "cpu_s",
@@ -203,6 +203,7 @@ def _row(run: Run, scalar: Scalar) -> Row:
     return row | {
         **summary["mesh"],
         "result": scalar.value_in(summary, measured.rows),
+        "result_error": scalar.error_in(summary.get("errors", {}), measured.rows),
         **{key: measured.typical(key) for key in TIMES},
         # of the first run, which may have compiled kernels
         "jit_first_s": measured.first["jit_s"] if measured.first else None,

@@ -14,13 +14,10 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.fold import FoldLost
-from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.runs.running import Result, run
-from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene_cache import SceneCache
-from magshell_fenicsx.studies.folds import Continuation, fold_row, has_knockdown, scene_of
+from magshell_fenicsx.studies.folds import Continuation, has_knockdown, result_of_fold, scene_of
 from magshell_fenicsx.studies.outcome import Outcome, outcome_of
 from magshell_fenicsx.studies.points import Axis, Case, SweepPoint, last_numeric_axis
 
@@ -225,12 +222,9 @@ def _by_fold(
     except FoldLost:
         return None, factorisation.count - count_before
     work = factorisation.count - count_before
-    point = Point(fold.state, fold.value, fold.phi, 0.0, fold.unstable, fold.unstable)
-    record = Record("fold", fold.name, point, step=len(scene.problem.programme))
-    history, row = History(located=[record]), fold_row(scene, fold)
-    result = Result(scene, fold.state, [row], path_history=history)
-    errors, wall_s = result.errors, time.perf_counter() - start
-    return outcome_of(result, "fold", work, wall_s, folds.columns, errors), work
+    result = result_of_fold(scene, fold)
+    estimates, wall_s = result.error_estimates, time.perf_counter() - start
+    return outcome_of(result, "fold", work, wall_s, folds.columns, estimates), work
 
 
 def _by_path(
@@ -260,8 +254,8 @@ def _by_path(
         return Outcome.failed(str(e), time.perf_counter() - start, factorisations), None
     continuation = _continuation_from(link.at, result) if go_on else None
     work = factorisations + result.scene.newton.factorisation.count
-    errors, wall_s = result.errors, time.perf_counter() - start
-    return outcome_of(result, "path", work, wall_s, columns, errors), continuation
+    estimates, wall_s = result.error_estimates, time.perf_counter() - start
+    return outcome_of(result, "path", work, wall_s, columns, estimates), continuation
 
 
 def _continuation_from(parameter: float, result: Result) -> Continuation | None:

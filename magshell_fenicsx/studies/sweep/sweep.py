@@ -290,7 +290,7 @@ def _words(outcome: Outcome, scalar: Scalar | None) -> str:
     """
     result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
-        value, error = outcome.value(scalar), outcome.errors.get(scalar.name)
+        value, error = outcome.value(scalar), outcome.error(scalar)
         result_text = f"no {scalar.name}"
         if value is not None:
             result_text = f"{scalar.name} = {number_with_error(value, error)}"
@@ -498,10 +498,9 @@ def _write_points(
         for point, outcome in outcomes_of_points
     ]
     # with the requested number, if there is one
-    if results:
-        name = scalar.name if scalar else ""
+    if results and scalar:
         rows = [
-            row | {"result": value, "result_error": outcome.errors.get(name)}
+            row | {"result": value, "result_error": outcome.error(scalar)}
             for row, value, (_, outcome) in zip(rows, results, outcomes_of_points, strict=True)
         ]
     first_point, _ = outcomes_of_points[0]
@@ -541,4 +540,5 @@ def sweep_row(outcome: Outcome) -> Mapping[str, Any]:
             column: outcome.errors.get(name)
             for name, column in (("knockdown", "k_d_error"), ("barrier", "barrier_error"))
         },
+        "errors_not_estimated": outcome.why_not_estimated,
     }
