@@ -63,8 +63,8 @@ class EntityBatch:
     rule
         The quadrature that all of them share.
     geometry
-        (n, 2 sides + 1): the covectors of the edge in the reference coordinates of each side (see
-        `shape_tables.edge_covector`), and the width of the cells over it; (n, 0) for cells.
+        (n, 3 sides): the covectors of the edge in the reference coordinates of each side (see
+        `shape_tables.edge_covector`), and the width of the cell of each side; (n, 0) for cells.
     """
 
     cells: tuple[NDArray[np.int32], ...]
@@ -227,8 +227,8 @@ def _edge_batches(
         for chunk in _chunks(edges, len(rule.weights)):
             cells_of_sides = tuple(np.ascontiguousarray(side) for side in cells[chunk].T)
             # by the edge's number in the cell on side 0
-            width = edge_width(V, cells_of_sides, np.full(len(chunk), kind[0]))
-            geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), width])
+            widths = edge_widths(V, cells_of_sides, np.full(len(chunk), kind[0]))
+            geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), widths])
             yield EntityBatch(cells_of_sides, rule, geometry)
 
 
@@ -291,12 +291,12 @@ def _corner(
     return np.asarray(compat.geometry_dofs(V.mesh)[cells, first_corners])
 
 
-def edge_width(
+def edge_widths(
     V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Return the mean area of the cells at each edge over the edge's length, (n,).
+    """Return the area of the cell on each side of an edge over the edge's length, (n, sides).
 
-    It is about half the height of the triangles over the edge, in the flat mesh.
+    It is half the height of the triangle over the edge, in the flat mesh.
 
     Parameters
     ----------
@@ -307,15 +307,14 @@ def edge_width(
     """
     # for each side the places (n, 3, 3) of the corners of its cells
     corners = [V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[side]] for side in cells]
-    areas = [_triangle_areas(places) for places in corners]
-    mean_area = sum(areas) / len(areas)
+    areas = np.column_stack([_triangle_areas(places) for places in corners])
     # both ends of each edge, as corners of the cell on side 0
     first_corners, last_corners = np.array(EDGES)[edges].T
     start, end = (
         corners[0][np.arange(len(edges)), numbers] for numbers in (first_corners, last_corners)
     )
     length = np.linalg.norm(end - start, axis=1)
-    return np.asarray(mean_area / length)
+    return np.asarray(areas / length[:, None])
 
 
 def _triangle_areas(places: Array) -> Array:

@@ -125,6 +125,11 @@ def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
     return np.asarray(merged_labels[labels], dtype=np.int32)
 
 
+def component_count(V: fem.FunctionSpace) -> int:
+    """Return the number of connected components of the mesh; collective."""
+    return 1 + int(V.mesh.comm.allreduce(int(component_numbers(V).max(initial=0)), MPI.MAX))
+
+
 def _graph_components(
     starts: NDArray[np.int64], ends: NDArray[np.int64], count: int
 ) -> tuple[int, NDArray[np.int32]]:

@@ -134,7 +134,7 @@ def _number_lines(case: Case, problem: Problem) -> list[str]:
 
 
 def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
-    """Return lines on the size of a mesh, on slivers, and on what a mesh file contains.
+    """Return lines on the size of a mesh, and on what a mesh file contains.
 
     `patch` is the triangulation; None for a meridian.
     """
@@ -145,9 +145,6 @@ def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
     lines = [f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"]
     if patch is None:
         return lines
-    sliver = None if problem.body else problem.flat_triangle(patch)
-    if sliver:
-        lines.append(f"mesh: may be unstable: {sliver}")
     if isinstance(problem.shape, MeshFile):
         lines += _surface_lines(patch)
     return lines

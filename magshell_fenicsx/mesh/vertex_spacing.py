@@ -1,12 +1,9 @@
 """Distances between vertices of a mesh, and triangles that are too flat for their neighbours.
 
-The interior penalty of an edge is over the mean height of its two triangles. Where one is lower
-than about a hundredth of the other, the default penalty is too small, whatever the degree. So
-vertices that are nearer to each other than a part of the elements there share a grid line, or are
-refused.
-
-The interior penalty makes the slope of a displacement continuous across edges; a case sets its
-factor as `mesh.penalty`. The flatness of a triangle says how much higher its neighbours are.
+A triangle that is much lower than its neighbours costs digits: the stiffness between its vertices
+grows as the third power of one over its height. So vertices that are nearer to each other than a
+part of the elements there share a grid line, or are refused. The flatness of a triangle says how
+much higher its neighbours are.
 """
 
 from collections.abc import Callable
@@ -19,16 +16,15 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, directed_sides
 Array = NDArray[np.float64]
 # over R: nearer places are one, and a place so near to an edge is on it
 SAME_PLACE_TOLERANCE = 1e-6
-# over the element size: nearer vertices make cells too flat; at half of it plates are unstable
+# over the element size: nearer vertices make flat cells
 MIN_VERTEX_DISTANCE = 0.02
 MAX_GROUP_WIDTH = 0.2  # over the element size: places farther apart have grid lines of their own
 MIN_DIGITS, MAX_DIGITS = 4, 17  # significant digits of a number in a message
 TEXT_PRECISION = 0.05  # relative error of the difference of two places in a message
-# `flatness` that the default penalty stands: grids are unstable from 26 to 37, gmsh's from 32 to 47
-MAX_FLATNESS = 25.0
+# `flatness` times the degree squared, beyond which rounding hides the stiffness of a plate: with
+# elements of a quarter to a tenth of its length, Newton's method fails at 5000 to 20 000
+MAX_FLATNESS = 6000.0
 SHORT_SIDE = 0.05  # a side over another one, below which messages tell its ends
-# `flatness` that no penalty stands: rounding then gives rigid motions a stiffness
-MAX_FLATNESS_OF_ANY_PENALTY = 400.0
 
 
 def grouped_by_distance(
@@ -134,24 +130,27 @@ def flatness(patch: PatchMesh) -> Array:
     return np.asarray(np.nan_to_num(ratios, nan=np.inf).reshape(3, -1).sum(axis=0))
 
 
-def flat_triangle(
-    patch: PatchMesh, penalty: float, default: float, length: float, unit: str
-) -> str:
-    """Return a message about a triangle too flat for the penalty; "" if there is none.
+def refuse_flat(patch: PatchMesh, degree: int, length: float, unit: str, key: str) -> None:
+    """Check that no triangle is so flat that rounding hides what holds the shell.
 
     Parameters
     ----------
-    penalty, default
-        The factor of the interior penalty, and the one that a case has by default.
-    length
-        R in the coordinates of the message.
-    unit
-        Unit of the coordinates in the message, such as "over R".
+    degree
+        Degree of the elements.
+    length, unit
+        R in the coordinates of the message, and their unit, such as "over R".
+    key
+        Key with which the message begins.
+
+    Raises
+    ------
+    MeshError
+        With the place of the flattest triangle.
     """
     ratios = flatness(patch)
     flattest = int(ratios.argmax())
-    if ratios[flattest] * default <= MAX_FLATNESS * penalty:
-        return ""
+    if ratios[flattest] < MAX_FLATNESS / degree**2:
+        return
     corners = patch.embedding(patch.nodes[patch.cells[flattest, :3]]) * length
     x, y, z = corners.mean(axis=0)
     sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
@@ -162,38 +161,8 @@ def flat_triangle(
         side = int(sides.argmin())
         start, end = distinguishable_texts(corners[side], corners[(side + 1) % 3])
         near_vertices = f", with vertices at ({start}) and ({end})"
-    hint = _penalty_hint(float(ratios[flattest]), default)
-    return (
-        f"the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {unit}, is {height:.3g} high "
+    raise MeshError(
+        f"{key}: the triangle around ({x:.9g}, {y:.9g}, {z:.9g}), {unit}, is {height:.3g} high "
         f"and {sides.max():.3g} long{near_vertices}, too flat beside its "
-        f"neighbours: make triangles of like heights there{hint}"
+        "neighbours: make triangles of like heights there"
     )
-
-
-def _penalty_hint(triangle_flatness: float, default: float) -> str:
-    """Return a hint at the penalty that a `flatness` needs; empty where none helps."""
-    if not triangle_flatness < MAX_FLATNESS_OF_ANY_PENALTY:
-        return ""
-    needed = np.ceil(default * triangle_flatness / MAX_FLATNESS / 100) * 100
-    return f", or take mesh.penalty: {needed:g}"
-
-
-def refuse_flat(patch: PatchMesh, default: float, length: float, unit: str, key: str) -> None:
-    """Check that no triangle is so flat that no penalty helps.
-
-    Parameters
-    ----------
-    default
-        The default factor of the interior penalty.
-    length, unit
-        R in the coordinates of the message, and their unit.
-    key
-        Key with which the message begins.
-
-    Raises
-    ------
-    MeshError
-        With the place of the flattest triangle.
-    """
-    if not flatness(patch).max() < MAX_FLATNESS_OF_ANY_PENALTY:
-        raise MeshError(f"{key}: {flat_triangle(patch, default, default, length, unit)}")

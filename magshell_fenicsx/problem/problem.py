@@ -29,9 +29,9 @@ from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.mesh.unfolding import double_sector
-from magshell_fenicsx.mesh.vertex_spacing import flat_triangle, refuse_flat
+from magshell_fenicsx.mesh.vertex_spacing import refuse_flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, with_cell_at_edge
-from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
+from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
@@ -423,15 +423,8 @@ class Problem:
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         if not self.body:
             key = "shell.file" if self._file_of_shell else "mesh"
-            # only triangles so flat that no penalty helps: the default one is for the message
-            _, default_penalty_of_degree, length, unit = self._penalty_and_unit
-            refuse_flat(patch, default_penalty_of_degree, length, unit, key)
+            refuse_flat(patch, self.mesh.degree, *self.unit_of_places, key)
         return patch
-
-    def flat_triangle(self, patch: PatchMesh) -> str:
-        """Return a message about a triangle that is too flat for the penalty; empty if none is."""
-        penalty, default_penalty_of_degree, length, unit = self._penalty_and_unit
-        return flat_triangle(patch, penalty, default_penalty_of_degree, length, unit)
 
     @property
     def _file_of_shell(self) -> MeshFile | None:
@@ -440,16 +433,14 @@ class Problem:
         return file if file and not file.in_memory else None
 
     @property
-    def _penalty_and_unit(self) -> tuple[float, float, float, str]:
-        """The penalty, the default penalty of the degree, R in a unit, and this unit in words.
+    def unit_of_places(self) -> tuple[float, str]:
+        """R in the unit of places in messages on the mesh, and this unit in words.
 
-        The unit is that of messages: R, or the coordinates of the shell's mesh file.
+        It is R, or that of the coordinates of the shell's mesh file.
         """
-        default = default_penalty(self.mesh.degree)
-        length, unit = 1.0, "over R"
         if self._file_of_shell:
-            length, unit = 1 / self._file_of_shell.scale, "in the file's coordinates"
-        return self.mesh.penalty or default, default, length, unit
+            return 1 / self._file_of_shell.scale, "in the file's coordinates"
+        return 1.0, "over R"
 
     def _triangulated_by_gmsh(self, shape: PlaneShape) -> PatchMesh:
         """Return the mesh of a plane shape by gmsh; on one rank.

@@ -288,8 +288,7 @@ class EnergyFactory:
         )
         v = fem.Function(self.u.function_space)
         jets = domain.j0, domain.jet(self.u), domain.jet(v)
-        _, boundary_width = domain.widths  # of cells beside interior and boundary edges
-        arguments = *jets, domain.covector, boundary_width, *density.parameters
+        arguments = *jets, domain.covector, domain.width, *density.parameters
         energy = density.function(*arguments) * domain.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 

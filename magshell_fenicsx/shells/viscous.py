@@ -611,17 +611,24 @@ def _work_on_interior_edges(
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
-    # means over both sides: viscous moment, elastic moment, and penalty
-    given_moment, moment, stiffness = 0, 0, 0
+    # on each side: viscous moment, elastic moment, and stiffness of the penalty
+    moments = list[tuple[Expr, Expr, Expr]]()
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
         # j and v are the jets of placement and displacement on this side; `edge` is the inverse
         # metric, the unit conormal, and its square, which is 1
         edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
-        given_moment += law.edge_moment(*stresses.strain(j, side), *edge) / 2
-        moment += law.edge_moment(*_strains(j, v), *edge) / 2
-        side_stiffness = law.edge_stiffness(kin.membrane_strain(j, v), *edge)
-        # penalty over the width of the cells beside interior edges
-        stiffness += side_stiffness / 2 * model.sigma / domain.widths[0]
+        moments.append(
+            (
+                law.edge_moment(*stresses.strain(j, side), *edge),
+                law.edge_moment(*_strains(j, v), *edge),
+                law.edge_stiffness(kin.membrane_strain(j, v), *edge),
+            )
+        )
+    widths = domain.width("+"), domain.width("-")
+    given_moment, moment, side_stiffness = (
+        edges.mean_by_width(pair, widths) for pair in zip(*moments, strict=True)
+    )
+    stiffness = side_stiffness * model.sigma / ((widths[0] + widths[1]) / 2)
     opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
     # length of the edge over its length in coordinates
     stretch = (conormals[0][2] + conormals[1][2]) / 2
@@ -646,8 +653,7 @@ def _works_on_held_edges(
     edge, law = (kin.inverse_metric(r0), (nu1, nu2), 1), _small_strain_law(model, r0)
     given_moment = law.edge_moment(*stresses.strain(r0, ""), *edge)
     moment = law.edge_moment(E, K, *edge)
-    # penalty over the width of the cells beside boundary edges
-    stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
+    stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.width
     works = []
     for held_edge in factory.held_edges:
         jump_of = _jump_of(held_edge, r0, m)

@@ -41,6 +41,7 @@ from magshell_fenicsx.simulate.steps import (
     records_of,
     symmetry_switch_of_step,
 )
+from magshell_fenicsx.simulate.undeformed_instability import cause_of_instability
 
 STEPS_OF_RISE = 4  # first steps in which an energy rises that moves the undeformed shell
 # begin of the remark on a path that stops beyond the instability that answers it
@@ -195,8 +196,10 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
         clock = initial_clock(scene, first_load, state)
     yield record(pivots, 1, clock)
     if pivots:
-        reason = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
-        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {reason}")
+        raise Stopped(
+            f"the undeformed shell is unstable in {pivots} directions: "
+            f"{cause_of_instability(scene, state)}"
+        )
 
 
 class _StepRun:

@@ -27,6 +27,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.global_mesh import component_count
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import NoJournal, NoProgress, Progress, SolverJournal
 from magshell_fenicsx.continuation.snes import NewtonOptions
@@ -242,7 +243,8 @@ class Scene:
         # A clamped support holds a shell for sure. But a mesh file may have several pieces, each of
         # which must be held. And a meridian is always examined.
         is_from_file = surface is not None and surface.from_mesh_file
-        may_be_loose = self.model.axisymmetric or is_from_file
+        is_in_pieces = is_from_file and component_count(self.model.V) > 1
+        may_be_loose = self.model.axisymmetric or is_in_pieces
         is_held_for_sure = self.problem.fixed and not may_be_loose
         # for frequencies alone, without loads, nothing need hold the shell
         self.allows_rigid_motion = not is_held_for_sure and self.problem.at_rest
@@ -252,8 +254,7 @@ class Scene:
             free_motion = self.model.free_motion(self.unloaded().mu)
         # only a case of steps in time may leave it free: inertia resists it
         if free_motion and not self.problem.moves_freely:
-            flat = self.flat_triangle
-            raise MeshError(f"mesh: {flat}" if flat else free_motion + self.problem.support_hint)
+            raise MeshError(free_motion + self.problem.support_hint)
         self.free_in_time = bool(free_motion)
         if free_motion:
             self.warnings.append(NOT_COUNTED)
@@ -292,14 +293,6 @@ class Scene:
         """The name of `problem` in earlier versions."""
         warn("Scene.plan is now Scene.problem", DeprecationWarning, stacklevel=2)
         return self.problem
-
-    @property
-    def flat_triangle(self) -> str:
-        """Message on a triangle that is too flat for the penalty; "" if none is."""
-        surface = self.model.midsurface
-        if surface is None or self.problem.body:
-            return ""
-        return self.problem.flat_triangle(surface.patch)
 
     @property
     def cells(self) -> int:

@@ -13,14 +13,12 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.vertex_spacing import (
-    MAX_FLATNESS,
     SAME_PLACE_TOLERANCE,
     distinguishable_texts,
     flatness,
 )
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.record import Stopped
 
 h, NU = 0.02, {"thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0}
 D = h**3 / 12
@@ -105,7 +103,7 @@ def test_near_coordinates_share_a_line(kind: str) -> None:
         place = patch.embedding(patch.points[name][None])[0]
         assert place == pytest.approx(points[name], abs=2 * SAME_PLACE_TOLERANCE)
         assert np.linalg.norm(vertices - place, axis=1).min() < 1e-12
-    assert flatness(patch).max() < MAX_FLATNESS / 2
+    assert flatness(patch).max() < 12.5
 
 
 @pytest.mark.parametrize(
@@ -259,25 +257,18 @@ def of_file(file: Path, **mesh: Any) -> Case:
     return Case.from_source(data | {"symmetry": "none"})
 
 
-def test_a_flat_triangle_of_a_file(tmp_path: Path) -> None:
-    """It is named, with the penalty that helps; with that the end rises by F L^3/(3 D b), a beam's,
-    1e-4."""
-    file, said = (
-        columns(tmp_path / "a.msh", 1e-3),
-        r"unstable in \d+ directions: the triangle around \(0.400[36]",
-    )
-    with pytest.raises(Stopped, match=said) as e:
-        list(follow(Scene(of_file(file))))
-    enough = re.search(r"mesh.penalty: (\d+)", str(e.value))
-    assert enough
-    scene = Scene(of_file(file, penalty=float(enough[1])))
+@pytest.mark.parametrize("width", [1e-3, 2e-4])
+def test_flat_triangles_of_a_file(tmp_path: Path, width: float) -> None:
+    """Beside triangles 200 and 1000 times as high the end rises by F L^3/(3 D b), a beam's, 1e-4;
+    the first had unstable directions, of the second the clamped shell was said not to be held."""
+    scene = Scene(of_file(columns(tmp_path / "a.msh", width)))
     *_, last = follow(scene)
     assert scene.observe(last.point.state)["w_over_h"] * h == pytest.approx(
         1e-9 / (3 * D * 0.2), rel=1e-4
     )
 
 
-def test_a_triangle_that_no_penalty_stands(tmp_path: Path) -> None:
+def test_a_triangle_too_flat_for_rounding(tmp_path: Path) -> None:
     """It was said that the clamped shell is not held."""
     problem = make_problem(of_file(columns(tmp_path / "a.msh", 1e-4)))
     with pytest.raises(

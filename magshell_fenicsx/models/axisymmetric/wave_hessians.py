@@ -298,12 +298,12 @@ class _WaveBatch:
         """Return whether an energy counts from an initial placement other than r0."""
         return e.from_initial and self._domain.initial_placement is not None
 
-    def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
-        """Return the covector on every side and the width of an edge; None in cells.
+    def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], list[Expr]] | None:
+        """Return the covector and the width on every side of an edge; None in cells.
 
-        Here an edge is a circle, at a vertex of the meridian. The width is half the mean length of
-        the cells beside it, as triangles have half their height there. `r0` has the placement's jet
-        on every side.
+        Here an edge is a circle, at a vertex of the meridian. The width is half the length of the
+        cell beside it, as triangles have half their height there. `r0` has the placement's jet on
+        every side.
         """
         density = self._energies[0].density  # all energies of a batch are on edges, or none
         if density is None or not density.on_edges:
@@ -313,7 +313,7 @@ class _WaveBatch:
             self._geometry[2 * side + 1] / 2 * ufl.sqrt(ufl.dot(r0[side].r1, r0[side].r1))
             for side in self._sides
         ]
-        return covectors, sum(widths, ufl.zero()) / len(widths)
+        return covectors, widths
 
     def _revolved_jets(self, field: fem.Function) -> list[Jet]:
         """Return the jets of an axisymmetric point field on each side of an entity."""
@@ -425,15 +425,15 @@ def _perturbed_density(
     r0: Sequence[Jet],
     u: Sequence[Jet],
     v: Sequence[Jet],
-    edge: tuple[Sequence[Expr], Expr] | None,
+    edge: tuple[Sequence[Expr], Sequence[Expr]] | None,
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
     """Return a density whose Hessian in v, at v = 0, is that of the energy at u + v.
 
     A virtual work w(u, v) may have no potential; its derivative by u then is not symmetric. The
     quarter of w(u + v, v) - w(u - v, v) is quadratic in v and has the symmetric part as its
-    Hessian. All jets are given on every side; `edge` has the covectors and the width, or is None in
-    cells.
+    Hessian. All jets are given on every side; `edge` has the covectors and the widths, or is None
+    in cells.
     """
     u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:

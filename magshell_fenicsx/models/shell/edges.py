@@ -3,17 +3,19 @@
 A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that quantity over its
 undeformed value, an edge contributes
 
-    {M_nunu} J + sigma D/(2 h_e) J^2        per undeformed length.
+    {M_nunu} J + sigma {D}/(2 h_e) J^2      per undeformed length.
 
 It is one energy: derived twice it gives a symmetric tangent. Every expression is invariant under
-exchange of '+' and '-'.
+exchange of '+' and '-'. The means {M_nunu} and {D} weight each side by its width: however narrow a
+cell is beside its neighbour, the same sigma holds its moment (docs/theory.md).
 
 - '+' and '-' are the cells on both sides of an edge; [n] is the jump of the normal, {} a mean.
 - nu is the outward conormal of a cell at the edge, r_nu the derivative of the place along it, and
   b_nunu the curvature across the edge. M_nunu is the moment that works on it.
 - m is the covector (2,) of an edge (`kinematics.conormal`); an edge's parameter is its length in
   the coordinates, or a number from 0 to 1.
-- h_e is the `width` of the cells at the edge, sigma the penalty, D a bending stiffness.
+- The `width` of a cell at an edge is half its height over it, h_e the mean of both sides; sigma is
+  the penalty, D a bending stiffness.
 - A natural shape (`Forms`) is the one that the shell would have without stress. Its `kink(nu)` is
   its curvature across an edge over the undeformed one, `along(nu)` the square of its stretch there.
 - A jet is a field's value with its first and second derivatives.
@@ -73,12 +75,17 @@ def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
     return -ufl.dot(ufl.cross(n_plus, n_minus), edge_tangent), ufl.dot(n_plus, n_minus)
 
 
+def mean_by_width(values: tuple[Expr, Expr], widths: tuple[Expr, Expr]) -> Expr:
+    """Return the mean of the values on both sides of an edge, weighted by the cells' widths."""
+    return (values[0] * widths[0] + values[1] * widths[1]) / (widths[0] + widths[1])
+
+
 def two_sided(
     J: Expr,
     r0: Sides,
     u: Sides,
     m: tuple[Expr, Expr],
-    width: Expr,
+    widths: tuple[Expr, Expr],
     sigma: Expr,
     *,
     law: tuple[Law, Law],
@@ -86,7 +93,7 @@ def two_sided(
 ) -> Expr:
     """Energy of an interior edge with a jump J, per unit of its parameter.
 
-    It is {M_nunu} J + sigma D/(2 h_e) J^2 per undeformed length.
+    It is {M_nunu} J + sigma {D}/(2 h_e) J^2 per undeformed length.
 
     Parameters
     ----------
@@ -96,8 +103,8 @@ def two_sided(
         Jets on both sides, '+' first.
     m
         Covectors of the edge on both sides; see `kinematics.conormal`.
-    width
-        h_e: half the height of the flat triangles over the edge, averaged.
+    widths
+        Width of the cell on each side.
     sigma
         Penalty.
     law
@@ -113,8 +120,8 @@ def two_sided(
         densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i])
         for i in range(2)
     ]
-    M, D = ((plus + minus) / 2 for plus, minus in zip(*moments, strict=True))
-    return edge_density(M, D, J, width, sigma) * stretch
+    M, D = (mean_by_width(pair, widths) for pair in zip(*moments, strict=True))
+    return edge_density(M, D, J, (widths[0] + widths[1]) / 2, sigma) * stretch
 
 
 def interior(
@@ -128,7 +135,7 @@ def interior(
     """Energy of an interior edge between cells that meet smoothly, or nearly so.
 
     It is per unit of the edge's parameter. The jump of the normal stands for the angle, whose sine
-    it is. `rest` are the width and sigma of `two_sided`.
+    it is. `rest` are the widths and sigma of `two_sided`.
     """
     # the two components of the conormal on each side
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
@@ -151,7 +158,7 @@ def fold(
 
     J is the change of the angle, whatever its size. A natural kink is the limit of a narrow bend:
     its strength of b_nunu is the angle times the natural stretch across the fold. `rest` are the
-    width and sigma of `two_sided`.
+    widths and sigma of `two_sided`.
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])

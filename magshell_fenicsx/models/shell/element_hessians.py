@@ -78,7 +78,7 @@ class HessianIntegral:
         The batches of interior edges, which couple two cells; else empty.
     _u, _r0, _geometry
         Point fields of one batch at a time: the jets of u and of r0 on all sides; the covector of
-        each side, then the width of the edge.
+        each side, then the width of the cell of each side.
     _placements
         The jets of r0 at the points of each batch.
     _kernels, _prestress
@@ -105,7 +105,7 @@ class HessianIntegral:
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
         self._points = PointStorage(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * JET_SIZE * sides) for _ in range(2))
-        self._geometry = self._points.field(2 * sides + 1)
+        self._geometry = self._points.field(3 * sides)
         self._placements = Memo(
             lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
         )
@@ -285,7 +285,7 @@ class Kernel:
         u, r0
             Point fields with the jets of displacement and placement.
         geometry
-            Point field with the covectors (2,) on all sides, then the width of an edge.
+            Point field with the covectors (2,) on all sides, then the widths of the cells.
         sides
             Number of cells beside a point.
         """
@@ -295,9 +295,10 @@ class Kernel:
         z = self._points.field(3 * JET_SIZE) if of_v else u
         arguments = (r0, u, z) if of_v else (r0, u)
         jets = [_jets(field, sides) for field in arguments]
-        # on edges: the covector on each side, and the width
+        # on edges: the covector and the width of the cell on each side
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
-        edge = (m, geometry[2 * sides]) if density.on_edges else None
+        widths = [geometry[2 * sides + side] for side in range(sides)]
+        edge = (m, widths) if density.on_edges else None
         W = density.value_at(jets, edge, self._parameters)
         # W is then a virtual work w(u, v), linear in v. Half of its derivative by u along v is
         # quadratic in v, and has the symmetric part of that derivative as its Hessian.

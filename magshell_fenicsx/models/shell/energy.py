@@ -3,8 +3,8 @@
 - A density is an energy per area of the coordinates, or per unit of an edge's parameter, as a
   function of jets: a field's value with its first and second derivatives by two coordinates.
 - r0 is the placement, u the displacement, v a virtual displacement or an addition to u.
-- m is the covector (2,) of an edge: zero along it and positive outward. The width is that of the
-  cells at the edge.
+- m is the covector (2,) of an edge: zero along it and positive outward. The width is that of a
+  cell at the edge.
 - A side is one of the cells beside a point: two on an interior edge, else one.
 - A load without potential, as a live pressure, has a virtual work in place of an energy.
 - A term is an energy in a sum, multiplied by its amplitude: a load parameter, by name.
@@ -49,7 +49,7 @@ class Density:
     function
         The density as a function: on cells of (r0, u, *parameters), per area of the coordinates; on
         boundary edges of (r0, u, m, width, *parameters), see `edges`; on interior edges the same
-        with pairs of jets and covectors.
+        with pairs of jets, covectors and widths.
     parameters
         Numbers, or fields that vary over the surface; on interior edges `function` takes a field as
         a pair.
@@ -93,7 +93,7 @@ class Density:
     def value_at(
         self,
         jets: Sequence[Sequence[Jet]],
-        edge: tuple[Sequence[Expr], Expr] | None,
+        edge: tuple[Sequence[Expr], Sequence[Expr]] | None,
         parameters: Sequence[Parameter],
     ) -> Expr:
         """Return the value of the density, or of its virtual work, at given jets.
@@ -104,24 +104,22 @@ class Density:
             For each argument (r0, u, ...) its jets on every side. If there is a third one, v, a
             load without potential returns its virtual work along v; else the density is returned.
         edge
-            The covector on every side and the width; None on cells.
+            The covectors and the widths of all sides; None on cells.
         parameters
             Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
-        # arguments in the order of `function`: jets, then on edges the covectors and the width,
-        # then parameters. Jets and covectors are a pair of both sides, or the value of the only one
-        covectors = edge[:1] if edge else ()
+        # arguments in the order of `function`: jets, then on edges covectors and widths, each a
+        # pair of both sides, or the value of the only one; then parameters
         sided = [
             tuple(side_values) if self.sides == 2 else side_values[0]
-            for side_values in (*jets, *covectors)
+            for side_values in (*jets, *(edge or ()))
         ]
-        width = edge[1:] if edge else ()
         fields = [
             _halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters
         ]
         density = self.work if self.work and len(jets) == 3 else self.function
-        return density(*sided, *width, *fields)
+        return density(*sided, *fields)
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:

@@ -30,7 +30,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
+from magshell_fenicsx.assembly.batches import boundary_edges, edge_widths, interior_edges
 from magshell_fenicsx.assembly.free_parameters import FreeParameter
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo
@@ -485,8 +485,8 @@ def _points_on_edges(
     rows
         (points, sides) numbers of the points, counted cell by cell and edge by edge.
     geometry
-        (points, 6 sides + 1): the frame of each side, the covector of each side, then the width
-        of the cells at the edge.
+        (points, 7 sides): the frame of each side, the covector of each side, then the width of
+        the cell of each side.
     """
     # cells and local numbers of the edges, (edges, sides) each; the second side may be reversed
     if density.facets is None:
@@ -505,12 +505,11 @@ def _points_on_edges(
     p, q, s, area = frames[cells].transpose(2, 0, 1)
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)
-    width = edge_width(V, tuple(cells.T), edges[:, 0])
     # all points of an edge have the same geometry
     columns = [
         frames[cells].reshape(-1, FRAME_SIZE * density.sides),
         m.reshape(-1, 2 * density.sides),
-        width[:, None],
+        edge_widths(V, tuple(cells.T), edges[:, 0]),
     ]
     geometry = np.repeat(np.concatenate(columns, axis=1), points_per_edge, axis=0)
     return rows.reshape(-1, density.sides), geometry

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
-from magshell_fenicsx.assembly.global_mesh import component_numbers
+from magshell_fenicsx.assembly.global_mesh import component_count, component_numbers
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
 from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, symmetric_part
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
@@ -365,8 +365,7 @@ def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDAr
     """
     # the first nodes of a rank are its own; each has three unknowns
     piece_of_node = component_numbers(r0.function_space)[: system.size // 3]
-    last_piece = system.comm.allreduce(int(piece_of_node.max(initial=0)), MPI.MAX)
-    return [piece_of_node == n for n in range(1 + last_piece)]
+    return [piece_of_node == n for n in range(component_count(r0.function_space))]
 
 
 def _unresisted_motions(
