@@ -192,8 +192,8 @@ def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -
 
 
 def _is_tube(context: Context, outline: "Outline") -> bool:
-    """Return whether a shell is a cylinder that is closed around e3."""
-    return context.shell.geometry == "cylinder" and outline.round
+    """Return whether a shell, and no solid, is a cylinder that is closed around e3."""
+    return context.shell.geometry == "cylinder" and outline.round and not context.solid
 
 
 def _tube_sizes(context: Context, sizing: SizingContext) -> tuple[float, float]:
