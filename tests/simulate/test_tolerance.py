@@ -118,6 +118,15 @@ def test_knockdown_on_the_meridian(tolerance: float) -> None:
     check(buckling(tolerance, symmetry="auto"), KNOCKDOWN[0.0])
 
 
+def test_waves_are_carried_without_their_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The load at nine waves is that of degree 5 with 50 cells, by the path of one mesh alone."""
+    monkeypatch.setattr(tolerance, "from_near", None)  # which would compute another path
+    problem = Case.load(CASES / "cylinder_waves.yaml", ["mesh.tolerance=1e-5"]).problem()
+    mesh = adapted(problem, COMM)
+    assert abs(mesh.best.result / 0.113753182 - 1) < mesh.best.estimate < 1e-5
+    assert [each.degree for each in mesh.rounds] == [3, 4]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "lambda_m"), [(1e-2, 0.0), (1e-3, -0.00184)])
 def test_knockdown(tolerance: float, lambda_m: float) -> None:
