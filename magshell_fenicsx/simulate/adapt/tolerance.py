@@ -8,9 +8,9 @@ path.
     on which all cells have equal shares in the error (`indicators`) and the expected error is 0.55
     of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
 
-Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where
-cells cost nothing, on a grid and on a surface of few cells the error may be far below a loose
-tolerance.
+Meridians are refined uniformly, where cells cost nothing. Of grids, whose lines go from edge to
+edge, the lines are placed such that the intervals between them have equal shares. On a meridian and
+on a surface of few cells the error may be far below a loose tolerance.
 
 A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with
 smaller elements, and with one more layer. The two changes of the result estimate the two parts of
@@ -45,7 +45,16 @@ from magshell_fenicsx.models.shell.law import work
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.mesh_sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice, equidistributed
+from magshell_fenicsx.simulate.adapt.choice import (
+    GRID_FACTOR,
+    Adapted,
+    AdaptiveRound,
+    Choice,
+    LineSpacing,
+    Sampled,
+    equidistributed,
+    equidistributed_lines,
+)
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
     Ending,
@@ -78,9 +87,9 @@ DEGREES = (3e-3, 3), (2e-4, 4), (0.0, 5)
 PATH_DEGREE = 3  # degree of the path
 AIM, MIN_REDUCTION = 0.55, 1 / 5  # estimated error over the tolerance
 COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
-# least factors of the refinement: on a meridian cells cost less than another round, and contact
-# makes the error fall more slowly; of a grid a smaller one may add no line
-MERIDIAN_FACTOR, GRID_FACTOR = 1.5, 1.25
+# least factor of the refinement of a meridian, where cells cost less than another round; contact
+# makes the error fall slowly
+MERIDIAN_FACTOR = 1.5
 MIN_CELLS_TO_COARSEN = 50  # a surface with at most so many cells is not coarsened
 Solved = tuple[Scene, Ending]
 
@@ -499,11 +508,11 @@ def _instability_near_by(scene: Scene, source: Scene, neighbour: Ending) -> Endi
     Returns
     -------
     Ending or None
-        None if the end is another one, is not found so, or its path is needed: cells of other
-        surfaces than grids are chosen by its tangent.
+        None if the end is another one, is not found so, or its path is needed: cells of surfaces
+        that gmsh triangulates are chosen by its tangent.
     """
     record = neighbour.record
-    if record is None or not _is_refined_uniformly(scene.problem):
+    if record is None or not _is_refined_uniformly(scene.problem, neighbour):
         return None
     try:
         state = state_on_other_mesh(source, scene, record, carry)
@@ -544,8 +553,8 @@ def _remeshed(
 ) -> Choice | None:
     """Return another mesh of the same degree with a given change of the error; collective.
 
-    Meridians, mesh files and grids are refined uniformly. Other surfaces get cells with equal
-    shares in the error.
+    Meridians and mesh files are refined uniformly. Other surfaces get cells with equal shares in
+    the error, and grids intervals between their lines.
 
     Parameters
     ----------
@@ -560,7 +569,7 @@ def _remeshed(
     (scene, _), degree = coarse_solution, choice.degree
     order = 2 * degree - 2  # of convergence of an energy
     problem = scene.problem
-    if _is_refined_uniformly(problem):
+    if _is_refined_uniformly(problem, coarse_solution[1]):
         refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1:
             least_factor = MERIDIAN_FACTOR if problem.axisymmetric else GRID_FACTOR
@@ -572,9 +581,14 @@ def _remeshed(
         return None
     centres, shares = indicators(coarse_solution, fine_solution)
     # sizes of elements over the surface, and the expected ratio of the numbers of cells
-    size, expected_ratio = equidistributed(
-        scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
-    )
+    size: Sampled | LineSpacing
+    if isinstance(grid := problem.shape, Grid):
+        lines = [grid.lines(axis, list(problem.points.values())) for axis in range(2)]
+        size, expected_ratio = equidistributed_lines(lines, centres, shares, order, reduction)
+    else:
+        size, expected_ratio = equidistributed(
+            problem.size, centres, shares, order, reduction, problem.material.h
+        )
     # the fine solution must fit too; twice its unknowns, since the ratio is an estimate
     fine_scene, _ = fine_solution
     if not _fits(fine_scene, 2 * fine_scene.model.system.dofs * expected_ratio):
@@ -582,9 +596,14 @@ def _remeshed(
     return Choice(degree, round(choice.refinement * expected_ratio**0.5, 3), size)
 
 
-def _is_refined_uniformly(problem: Problem) -> bool:
-    """Return whether a finer mesh has smaller cells everywhere: of meridians, files and grids."""
-    return problem.axisymmetric or bool(problem.mesh_file) or isinstance(problem.shape, Grid)
+def _is_refined_uniformly(problem: Problem, end: Ending) -> bool:
+    """Return whether a finer mesh has smaller cells everywhere.
+
+    It has on meridians, of mesh files, and on grids at an instability with a mode.
+    """
+    is_grid = isinstance(problem.shape, Grid)
+    is_mode_on_grid = is_grid and end.record is not None
+    return problem.axisymmetric or bool(problem.mesh_file) or is_mode_on_grid
 
 
 def _fits(scene: Scene, unknowns: float) -> bool:
