@@ -409,6 +409,9 @@ class SizingContext:
     local: bool
 
 
+LONG_TUBE_SIZE = 8.0  # over sqrt(Rh): elements along a tube without axial compression
+
+
 @dataclass(frozen=True)
 class MeshHints:
     """The element sizes that suit a load.
@@ -421,8 +424,12 @@ class MeshHints:
         Size of elements along the edge of a curved surface, over sqrt(Rh).
     largest
         Largest element size on a curved disc, over R; None for the usual one.
+    along_tube
+        Largest element size along a tube, over sqrt(Rh). Half a wave of axial compression is
+        pi sqrt(Rh)/(12 (1 - nu^2))^(1/4) long, 1.73 sqrt(Rh) for a Poisson's ratio of 0.3.
     """
 
     growth: float = 0.4
     rim: float = 1.4
     largest: float | None = None
+    along_tube: float = 2.0

@@ -39,6 +39,9 @@ RUBBER_EDGE_SIZE, RUBBER_EDGE_SIZE_AT_DEGREE_3 = 1.0, 2.8
 MIN_RUBBER_EDGE_SIZE = 0.014  # of these elements over R
 RUBBER_GROWTH = 1.0  # of the size per distance from there, where the shell is smooth
 GRID_EDGE_SIZE = 1.2  # over sqrt(Rh), along held edges of grids
+# around a tube, over sqrt(Rh) and over R: waves around it are at least twice as long as those of
+# axial compression, and at least nine elements resolve an oval
+AROUND_TUBE_SIZE, MAX_AROUND_TUBE_SIZE = 2.5, 0.7
 
 
 class MeshSection(Section):
@@ -50,8 +53,8 @@ class MeshSection(Section):
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""
     size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
-    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R
-    [the shell's length]"""
+    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R,
+    of tubes by their waves [the shell's length]"""
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
@@ -179,12 +182,25 @@ def grading(
 def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -> float:
     """Return the element size over R where nothing needs smaller elements, before refinement."""
     if outline.grid:
-        return min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
+        size = min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
+        return max(_tube_sizes(context, sizing)) if _is_tube(context, outline) else size
     if not outline.disc or context.shell.geometry == "disc":  # a strip, or a flat disc
         width = getattr(context.shell, "width", None) or 1.0
         return min(MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH * width)
     sizes = (hints.largest for hints in _hints_of_loads(context, sizing))
     return min((size for size in sizes if size is not None), default=MAX_SIZE)
+
+
+def _is_tube(context: Context, outline: "Outline") -> bool:
+    """Return whether a shell, and no solid, is a cylinder that is closed around e3."""
+    return context.shell.geometry == "cylinder" and outline.round and not context.solid
+
+
+def _tube_sizes(context: Context, sizing: SizingContext) -> tuple[float, float]:
+    """Return the largest element sizes over R around a tube and along it, before refinement."""
+    length = sqrt(sizing.h)  # sqrt(Rh) over R
+    along = min(hints.along_tube for hints in _hints_of_loads(context, sizing))
+    return min(AROUND_TUBE_SIZE * length, MAX_AROUND_TUBE_SIZE), along * length
 
 
 def _hints_of_loads(context: Context, sizing: SizingContext) -> list[MeshHints]:
@@ -200,6 +216,8 @@ def _growth(context: Context, sizing: SizingContext) -> float:
 def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
     """Return small elements along held edges of a grid, or along the rim of a curved disc.
 
+    Those of a tube are limited along both axes.
+
     A curved disc is the chart of a sphere, for example. Flat shapes have none, but for clamped
     edges of inflated rubber, where sizes do not depend on the refinement.
     """
@@ -212,6 +230,9 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()
+        if _is_tube(context, outline):  # a size along each axis, the same everywhere
+            for axis, tube_size in enumerate(_tube_sizes(context, sizing)):
+                features.append(LineFeature(axis, 0.0, tube_size / sizing.refinement, growth=0.0))
         # the sides are the low and the high one of the first axis, then those of the second
         for i, name in enumerate(grid.sides):
             axis, corner = i // 2, (grid.low, grid.high)[i % 2]

@@ -44,13 +44,12 @@ from magshell_fenicsx.continuation.modes import (
     nearest_to_zero,
 )
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
-from magshell_fenicsx.continuation.system import State, Vector, dot, symmetric_part
+from magshell_fenicsx.continuation.system import State, System, Vector, dot, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.quantities.registry import AMPLITUDES, OWN_MODES, amplitude
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.shells.waves import WaveFamily
 from magshell_fenicsx.simulate.adapt.ending import History, at_target
-from magshell_fenicsx.simulate.adapt.tolerance import SAFETY
 from magshell_fenicsx.simulate.contact_control import with_cuts_here
 from magshell_fenicsx.simulate.path_records import LOCATED
 from magshell_fenicsx.simulate.record import Record
@@ -60,6 +59,8 @@ from magshell_fenicsx.simulate.scene_cache import problem_on_mesh_of
 from magshell_fenicsx.simulate.stage import Stage, load_stage
 from magshell_fenicsx.simulate.steps import stage_of_step
 
+SAFETY = 1.25  # factor of the change by one degree more, for the error
+Transfer = Callable[[Scene, Scene, Vector], Vector]
 MAX_LOAD_CHANGE = 0.5  # over the load: an instability farther away is another one
 SOLVER_ERROR = 1e-4  # of Newton's method, over the change by one degree more
 SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue along the path
@@ -69,6 +70,7 @@ MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
 LATER = "limit_load_"  # before the number of an instability after the first
 LATER_TAKE_LONG = "this and later instabilities have no estimate, as it would take long"
 MOST_INSTABILITIES = 4  # of a path on a meridian, whose errors are estimated
+NO_EQUILIBRIUM = "with one degree more Newton's method finds no equilibrium"
 OTHERS_FIRST = (
     "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
     "too coarse"
@@ -351,6 +353,29 @@ def with_higher_degree(source: Scene, target: Scene, u: Vector) -> Vector:
     return target.model.system.zero_at_supports(fine_values.ravel()[: target.model.system.size])
 
 
+def state_on_other_mesh(
+    source: Scene, target: Scene, record: Record, transferred: Transfer
+) -> State:
+    """Return the state of a scene at a point like that of another scene; collective.
+
+    Parameters
+    ----------
+    source, target
+        Scene of the point, and the scene of the result.
+    record
+        The point.
+    transferred
+        Function that returns a displacement of `source` in the unknowns of `target`.
+
+    Raises
+    ------
+    NotEstimated, FoldLost, NoEigenpair, LinAlgError
+        If there is none nearby.
+    """
+    _refuse(source, record)
+    return DegreeComparison(source, target, record, transferred=transferred).state
+
+
 @dataclass(frozen=True)
 class DegreeComparison:
     """A point of a run, and the same point with one degree more.
@@ -363,12 +388,15 @@ class DegreeComparison:
         The point.
     is_later
         Whether it is an instability after another one.
+    transferred
+        Function that returns a displacement of `scene` in the unknowns of `fine`.
     """
 
     scene: Scene
     fine: Scene
     record: Record
     is_later: bool = False
+    transferred: Transfer = with_higher_degree
 
     @cached_property
     def changes(self) -> dict[str, float]:
@@ -422,7 +450,7 @@ class DegreeComparison:
         What the step holds has the value of the record.
         """
         fine_scene, record = self.fine, self.record
-        u = with_higher_degree(self.scene, fine_scene, record.point.state.u)
+        u = self.transferred(self.scene, fine_scene, record.point.state.u)
         # cuts belong to the mesh and the degree
         guess = with_cuts_here(fine_scene, State(u, dict(record.point.state.mu)))
         stage = load_stage(fine_scene)
@@ -457,10 +485,13 @@ class DegreeComparison:
     def _fold(self) -> State:
         """Return the state at the fold near the record."""
         stage, guess = self._stage()
-        du = with_higher_degree(self.scene, self.fine, self.record.point.du)
+        du = self.transferred(self.scene, self.fine, self.record.point.du)
         phi = stage.padded(du)
         name = self.record.amplitude
         state, fine_phi, unstable = fold_by_one_step(stage.newton, guess, phi, name)
+        system = stage.newton.system
+        if not _imbalance(system, state) < _imbalance(system, guess):
+            raise TooCoarse(NO_EQUILIBRIUM)
         _refuse_other_mode(stage, phi, fine_phi)
         self._refuse_later(unstable, self.record.point.negative_pivots)
         return stage.leave(state)
@@ -484,7 +515,7 @@ class DegreeComparison:
         b = critical_mode(newton, guess).vector
         held_state = held_along(newton, guess, b)
         if held_state is None:
-            raise TooCoarse("with one degree more Newton's method finds no equilibrium")
+            raise TooCoarse(NO_EQUILIBRIUM)
         state, _ = held_state
         system, tangent = newton.system, AugmentedTangent(newton, state, b)
         self._refuse_later(tangent.unstable, self.record.point.negative_pivots)
@@ -560,6 +591,12 @@ def _load_change(eigenvalue_change: float, slope: float, load: float) -> float:
     if not abs(eigenvalue_change) < largest_change * abs(slope):
         raise TooCoarse("with one degree more no mode is neutral nearby")
     return eigenvalue_change / slope
+
+
+def _imbalance(system: System, state: State) -> float:
+    """Return the square of the residual's length; collective."""
+    residual = system.residual(state.u, state.mu)
+    return dot(system.comm, residual, residual)
 
 
 def _refuse_other_mode(stage: Stage, phi: Vector, fine_phi: Vector) -> None:

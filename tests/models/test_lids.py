@@ -75,7 +75,7 @@ def test_a_tube_pulled_apart(symmetry: str) -> None:
         TUBE,
         {"bottom": "clamped", "top": "clamped"},
         symmetry=symmetry,
-        mesh={"degree": 3, "refinement": 0.3},
+        mesh={"degree": 3, "refinement": 0.4},
         loading=PRESSED,
     )
     *_, pulled = ms.trace(scene, "way", control="load", targets=[1.0])

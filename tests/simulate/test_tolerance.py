@@ -23,7 +23,15 @@ from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.adapt import tolerance
-from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, equidistributed
+from magshell_fenicsx.simulate.adapt.choice import (
+    GRID_FACTOR,
+    Adapted,
+    AdaptiveRound,
+    Choice,
+    LineSpacing,
+    equidistributed,
+    equidistributed_lines,
+)
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
     NoResult,
@@ -116,6 +124,15 @@ def half_mesh() -> Adapted:
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
 def test_knockdown_on_the_meridian(tolerance: float) -> None:
     check(buckling(tolerance, symmetry="auto"), KNOCKDOWN[0.0])
+
+
+def test_waves_are_carried_without_their_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The load at nine waves is that of degree 5 with 50 cells, by the path of one mesh alone."""
+    monkeypatch.setattr(tolerance, "from_near", None)  # which would compute another path
+    problem = Case.load(CASES / "cylinder_waves.yaml", ["mesh.tolerance=1e-5"]).problem()
+    mesh = adapted(problem, COMM)
+    assert abs(mesh.best.result / 0.113753182 - 1) < mesh.best.estimate < 1e-5
+    assert [each.degree for each in mesh.rounds] == [3, 4]
 
 
 @pytest.mark.slow
@@ -225,6 +242,37 @@ def test_equal_shares() -> None:
         reduction, rel=order * np.log(step)
     )
     assert more == pytest.approx(np.mean(change**-2.0), rel=0.05)
+
+
+def test_equal_shares_between_lines() -> None:
+    """Shares that grow e^3-fold along one axis of a grid and go as distance^7 are equal between the
+    new lines, which come nearer at its end. Beyond a plane of symmetry there are no shares.
+    """
+    n, order = 40, 6.0
+    lines = np.linspace(0, 1, n + 1)
+    middles = (lines[1:] + lines[:-1]) / 2
+    x, y = np.meshgrid(middles, middles[: n // 2])
+    centres = np.column_stack([x.ravel(), y.ravel()])
+    shares = np.exp(3 * centres[:, 0])
+    spacing, more = equidistributed_lines([lines, lines], centres, shares, order, 0.5)
+    along, across = (n * np.array([spacing(axis, place) for place in middles]) for axis in range(2))
+    step = 2 ** (1 / 8)  # distances are rounded to it
+    assert np.ptp(3 * middles + (order + 1) * np.log(along)) < (order + 1) * np.log(step) * 1.5
+    assert np.ptp(across) < 1e-12
+    assert (along**order).mean() < 1
+    assert along[-1] < 1 / GRID_FACTOR * step
+    assert more == pytest.approx(np.mean(1 / along) * np.mean(1 / across))
+
+
+def test_lines_are_kept_for_a_run_that_is_resumed() -> None:
+    problem = Case.load(CASES / "laminated_roof.yaml", ["mesh.tolerance=1e-3"]).problem()
+    extent = np.array([problem.shape.low, problem.shape.high]).T
+    spacing = LineSpacing(tuple(extent), tuple(each / 7 for each in extent + 1.0))
+    choice, tried = Choice(3, 0.5, spacing), AdaptiveRound(3, 0.5, 16, 255, 8.46e-8, 8.8e-3)
+    again = Adapted.from_json(problem, Adapted(problem, choice, tried, [tried]).to_json())
+    grid, grid_again = (each.applied(problem).shape for each in (choice, again.choice))
+    for axis in range(2):
+        assert grid_again.lines(axis, []).tolist() == grid.lines(axis, []).tolist()
 
 
 @pytest.mark.slow

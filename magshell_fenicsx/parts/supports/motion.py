@@ -18,7 +18,14 @@ from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.step_course import LoadStart, Target, Until
+from magshell_fenicsx.parts.step_course import (
+    LONG_TUBE_SIZE,
+    LoadStart,
+    MeshHints,
+    SizingContext,
+    Target,
+    Until,
+)
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -132,6 +139,11 @@ class EdgeSection(PathStep):
     def scale(self, load_start: LoadStart) -> float:
         return abs(self.factor or 1.0)
 
+    def mesh_hints(self, sizing: SizingContext) -> MeshHints:
+        """Return the element sizes for the motions: torsion makes long waves along a tube."""
+        is_torsion = all(_turns_about_e3(move) for move in self.moves)
+        return MeshHints(along_tube=LONG_TUBE_SIZE) if is_torsion else MeshHints()
+
     def refuse_unfit(self, context: Context) -> None:
         """Check that `boundary` holds all supports that move.
 
@@ -173,6 +185,14 @@ class EdgeSection(PathStep):
         R, turn, name = context.shell.reference, modelled.turn, context.step.name
         moves = (Move(tuple(move.supports), motion(move, name, R, turn)) for move in self.moves)
         return Loads(moves=tuple(moves))
+
+
+def _turns_about_e3(move: MoveSection) -> bool:
+    """Return whether supports turn about the axis e3, and do nothing else."""
+    if move.rotation is None or any(move.translation or []):
+        return False
+    axis, point = move.rotation.axis, move.rotation.point
+    return not any((*axis[:2], *point[:2]))
 
 
 def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMotion:

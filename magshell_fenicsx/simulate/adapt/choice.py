@@ -8,6 +8,7 @@ with a mesh of its own.
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -19,12 +20,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.continuation_run import LOAD_TOLERANCE
 from magshell_fenicsx.mesh.grading import Size
+from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 NEIGHBOURS = 3
 LARGEST_CHANGE = 2.5  # largest factor in one round, of a cell relative to the mean and of the mean
+GRID_FACTOR = 1.25  # least factor by which lines of a grid come nearer where they come nearest
 STEPS = 8  # sizes per factor of two; coarse steps make the mesh independent of rounding
 
 
@@ -57,6 +60,70 @@ class Sampled:
     def _tree(self) -> "scipy.spatial.cKDTree":
         """Search tree of the points."""
         return scipy.spatial.cKDTree(self.points)
+
+
+@dataclass(frozen=True)
+class LineSpacing:
+    """Distances of a grid's lines across each axis, as a function of the coordinate.
+
+    Attributes
+    ----------
+    coordinates, distances
+        For each axis coordinates (n,) in increasing order, and distances (n,) there.
+    """
+
+    coordinates: tuple[Array, ...]
+    distances: tuple[Array, ...]
+
+    def __call__(self, axis: int, x: float) -> float:
+        """Return the distance of the lines across an axis at a coordinate."""
+        return float(np.interp(x, self.coordinates[axis], self.distances[axis]))
+
+
+def equidistributed_lines(
+    lines: Sequence[Array], centres: Array, shares: Array, order: float, reduction: float
+) -> tuple[LineSpacing, float]:
+    """Return distances of lines for which the intervals between them have equal shares.
+
+    Parameters
+    ----------
+    lines
+        Coordinates of the lines of the old grid across each axis.
+    centres, shares
+        (n, 2) of its cells, and (n,) their shares of the error.
+    order
+        Power of the size in the error.
+    reduction
+        Wanted error over the error on the old grid.
+
+    Returns
+    -------
+    spacing, factor
+        The distances, and the factor of the number of cells.
+    """
+    # for each axis the factors of the distances that give each interval the mean of the shares
+    changes, expected_ratio = list[Array](), 0.0
+    for axis in range(2):
+        count = len(lines[axis]) - 1
+        interval = np.clip(np.searchsorted(lines[axis], centres[:, axis]) - 1, 0, count - 1)
+        sums = np.bincount(interval, shares, count)
+        # a half has no cells beyond its plane of symmetry
+        sums[sums == 0] = np.exp(np.log(sums[sums > 0]).mean())
+        geometric_mean = np.exp(np.log(sums).mean())
+        wished_change = (geometric_mean / sums) ** (1 / (order + 1))
+        change = np.clip(wished_change, 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+        expected_ratio += float(sums @ change**order / sums.sum()) / 2
+        changes.append(change)
+    # a common factor gives the wanted reduction; some lines come nearer by `GRID_FACTOR` at least
+    common = (reduction / expected_ratio) ** (1 / order)
+    common = float(np.clip(common, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
+    if reduction < 1:
+        common = min(common, 1 / (GRID_FACTOR * min(change.min() for change in changes)))
+    changes = [2 ** (np.round(STEPS * np.log2(change * common)) / STEPS) for change in changes]
+    middles = tuple((each[1:] + each[:-1]) / 2 for each in lines)
+    distances = tuple(np.diff(each) * change for each, change in zip(lines, changes, strict=True))
+    factor_of_cells = float(np.prod([np.mean(1 / change) for change in changes]))
+    return LineSpacing(middles, distances), factor_of_cells
 
 
 def equidistributed(
@@ -105,6 +172,10 @@ def _smoothed(centres: Array, wish: Array) -> Array:
     return np.asarray(np.exp(np.log(wish)[neighbours].mean(axis=1)))
 
 
+# fields of both kinds of sizes, as they are kept for a run that is resumed
+_KEYS_OF_SIZES = {Sampled: ("points", "sizes"), LineSpacing: ("coordinates", "distances")}
+
+
 @dataclass(frozen=True)
 class Choice:
     """A degree and a mesh; without `size` the elements have the default sizes over `refinement`.
@@ -112,15 +183,15 @@ class Choice:
     Attributes
     ----------
     size
-        Size function of the mesh; with it `refinement` only records the mean refinement relative to
-        the default.
+        Size function of the mesh, or spacing of a grid's lines; with it `refinement` only records
+        the mean refinement relative to the default.
     layers
         Number of layers of a solid; None of a shell.
     """
 
     degree: int
     refinement: float
-    size: Sampled | None = None
+    size: Sampled | LineSpacing | None = None
     layers: int | None = None
 
     def applied(self, requested: Problem) -> Problem:
@@ -129,6 +200,9 @@ class Choice:
         problem = requested.with_values(
             mesh | ({"solid.layers": self.layers} if self.layers else {})
         )
+        if isinstance(self.size, LineSpacing):
+            assert isinstance(problem.shape, Grid)
+            return replace(problem, shape=replace(problem.shape, size=self.size))
         return replace(problem, size=self.size) if self.size else problem
 
     def scene(self, requested: Problem, comm: MPI.Comm) -> Scene:
@@ -229,8 +303,10 @@ class Adapted:
 
     def _as_data(self) -> dict[str, Any]:
         """Return all except the problem as plain data for JSON; the best round by its index."""
-        size = self.choice.size
-        sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
+        size, sizes = self.choice.size, None
+        if size:
+            keys = _KEYS_OF_SIZES[type(size)]
+            sizes = {key: [each.tolist() for each in getattr(size, key)] for key in keys}
         content = {
             "best": self.rounds.index(self.best),
             "rounds": [asdict(each_round) for each_round in self.rounds],
@@ -248,7 +324,12 @@ class Adapted:
         """Return the mesh from the data of `_as_data`, for the same problem."""
         rounds = [AdaptiveRound(**round_data) for round_data in values["rounds"]]
         best, size = rounds[values["best"]], values["size"]
-        sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
+        sampled: Sampled | LineSpacing | None = None
+        if size and "points" in size:
+            sampled = Sampled(*(np.array(size[key]) for key in _KEYS_OF_SIZES[Sampled]))
+        elif size:
+            by_axis = (size[key] for key in _KEYS_OF_SIZES[LineSpacing])
+            sampled = LineSpacing(*(tuple(map(np.array, each)) for each in by_axis))
         branch = cls._from_data(requested, values["branch"]) if values.get("branch") else None
         return cls(
             requested,

@@ -322,8 +322,9 @@ class Ending:
     Attributes
     ----------
     kind
-        "fold" and "target" can be computed directly on another mesh. "held", a target with another
-        conjugate held, and "instability", any other instability, need the path.
+        "fold" and "target" can be computed directly on another mesh, and so can, on a meridian or a
+        grid, "instability", any other instability. "held", a target with another conjugate held,
+        needs the path.
     name
         The amplitude that varied.
     value
@@ -337,6 +338,8 @@ class Ending:
         the value.
     held
         The prescribed conjugate displacement; None if the load is prescribed.
+    record
+        The record of an instability; None of other ends.
     """
 
     kind: Literal["fold", "target", "held", "instability"]
@@ -345,6 +348,7 @@ class Ending:
     state: State
     tangent: Vector
     held: float | None = None
+    record: Record | None = None
 
 
 @dataclass
@@ -464,10 +468,11 @@ def _instability(end: Record) -> Ending:
         raise NoResult("an instability of a turning field is not a single load")
     # a fold of the model itself; an instability with a mode is one that the model excludes
     own_fold = end.label == "fold" and not end.mode
-    value = end.point.state.mu[end.amplitude]
-    return Ending(
-        "fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du
-    )
+    state, tangent = end.point.state, end.point.du
+    value = state.mu[end.amplitude]
+    if own_fold:
+        return Ending("fold", end.amplitude, value, state, tangent)
+    return Ending("instability", end.amplitude, value, state, tangent, record=end)
 
 
 def by_path(scene: Scene) -> Ending:

@@ -1,16 +1,16 @@
 """A mesh for a tolerance of the result: rounds of error estimation and remeshing that need only one
 path.
 
-    (a) Compute the whole path on a coarse mesh of degree 3, then its end with the degree that suits
-    the tolerance. (b) Compute the end with one degree more; the change of the result estimates the
-    error. (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of
-    it. (d) Else make a mesh on which all cells have equal shares in the error (`indicators`) and
-    the expected error is 0.55 of the tolerance; compute its end by Newton's method from the end of
-    (b); continue with (b).
+    (a) Compute the whole path on a coarse mesh of degree 3. (b) Compute its end with one degree
+    more; the change of the result estimates the error. (c) Stop if the estimate is at most the
+    tolerance, and on a surface at least a fifth of it. (d) If it is larger, and the degree is below
+    the one that suits the tolerance, continue with (b) with one degree more. (e) Else make a mesh
+    on which all cells have equal shares in the error (`indicators`) and the expected error is 0.55
+    of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
 
-Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where
-cells cost nothing, on a grid and on a surface of few cells the error may be far below a loose
-tolerance.
+Meridians are refined uniformly, where cells cost nothing. Of grids, whose lines go from edge to
+edge, the lines are placed such that the intervals between them have equal shares. On a meridian and
+on a surface of few cells the error may be far below a loose tolerance.
 
 A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with
 smaller elements, and with one more layer. The two changes of the result estimate the two parts of
@@ -36,6 +36,8 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.fold import FoldLost
+from magshell_fenicsx.continuation.modes import NoEigenpair
 from magshell_fenicsx.continuation.system import Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
@@ -43,15 +45,30 @@ from magshell_fenicsx.models.shell.law import work
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.mesh_sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.problem import Problem
-from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice, equidistributed
+from magshell_fenicsx.simulate.adapt.choice import (
+    GRID_FACTOR,
+    Adapted,
+    AdaptiveRound,
+    Choice,
+    LineSpacing,
+    Sampled,
+    equidistributed,
+    equidistributed_lines,
+)
 from magshell_fenicsx.simulate.adapt.ending import (
     CellFields,
     Ending,
     NoResult,
+    NotCarried,
     by_path,
     carry,
     from_near,
     values_of_all_cells,
+)
+from magshell_fenicsx.simulate.discretisation_error import (
+    SAFETY,
+    NotEstimated,
+    state_on_other_mesh,
 )
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -68,10 +85,11 @@ Say = Callable[[str], None]
 # the fastest degree for tolerances down to the first number
 DEGREES = (3e-3, 3), (2e-4, 4), (0.0, 5)
 PATH_DEGREE = 3  # degree of the path
-SAFETY = 1.25  # factor of the estimate for the error of the finer solution
 AIM, MIN_REDUCTION = 0.55, 1 / 5  # estimated error over the tolerance
 COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
-LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
+# least factor of the refinement of a meridian, where cells cost less than another round; contact
+# makes the error fall slowly
+MERIDIAN_FACTOR = 1.5
 MIN_CELLS_TO_COARSEN = 50  # a surface with at most so many cells is not coarsened
 Solved = tuple[Scene, Ending]
 
@@ -382,27 +400,28 @@ def rounds(
     """
     tolerance = problem.mesh.tolerance
     assert tolerance is not None
-    # to the degree that suits the tolerance, one by one, as Newton's method needs a near start
-    for degree in range(PATH_DEGREE + 1, _fastest_degree(tolerance) + 1):
-        choice = Choice(degree, choice.refinement)
-        coarse_solution = transferred(problem, choice, coarse_solution)
+    highest_degree = max(choice.degree, _fastest_degree(tolerance))
+    most_rounds = MOST_ROUNDS + highest_degree - choice.degree
     tried_rounds: list[tuple[AdaptiveRound, Choice]] = []
     while True:
         doing(
             f"a mesh for the tolerance {tolerance:g}: round {len(tried_rounds) + 1}, degree "
             f"{choice.degree}, estimating"
         )
-        fine_solution = transferred(
-            problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse_solution
-        )
+        fine_choice = replace(choice, degree=choice.degree + 1)
+        fine_solution = transferred(problem, fine_choice, coarse_solution)
         round_result = _judged(choice, coarse_solution, fine_solution)
         tried_rounds.append((round_result, choice))
         say(f"tolerance {tolerance:g}{suffix}: {_words_of_round(round_result)}")
         # A mesh far better than the tolerance is made coarser. A meridian need not: it is cheap.
         coarse_scene, _ = coarse_solution
         least_error = 0.0 if coarse_scene.problem.axisymmetric else MIN_REDUCTION * tolerance
-        if least_error <= round_result.estimate <= tolerance or len(tried_rounds) == MOST_ROUNDS:
+        if least_error <= round_result.estimate <= tolerance or len(tried_rounds) == most_rounds:
             break
+        # first up to the degree that suits the tolerance: the fine solution has one degree more
+        if round_result.estimate > tolerance and choice.degree < highest_degree:
+            choice, coarse_solution = fine_choice, fine_solution
+            continue
         next_choice = _remeshed(
             choice,
             coarse_solution,
@@ -475,7 +494,39 @@ def _coarsest_path(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
 def _on_other_mesh(problem: Problem, choice: Choice, neighbour: Solved) -> Solved:
     """Return scene and end on another mesh, from those on a mesh near by; collective."""
     scene = choice.scene(problem, neighbour[0].comm)
-    return scene, from_near(scene, *neighbour)
+    return scene, _instability_near_by(scene, *neighbour) or from_near(scene, *neighbour)
+
+
+def _instability_near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
+    """Return an instability with a mode, by one step from that on another mesh; collective.
+
+    Parameters
+    ----------
+    source, neighbour
+        Scene on the other mesh, and its end.
+
+    Returns
+    -------
+    Ending or None
+        None if the end is another one, is not found so, or its path is needed: cells of surfaces
+        that gmsh triangulates are chosen by its tangent.
+    """
+    record = neighbour.record
+    if record is None or not _is_refined_uniformly(scene.problem, neighbour):
+        return None
+    try:
+        state = state_on_other_mesh(source, scene, record, carry)
+        tangent = carry(source, scene, neighbour.tangent)
+    except (NotEstimated, NotCarried, FoldLost, NoEigenpair, np.linalg.LinAlgError):
+        return None
+    point = replace(record.point, state=state, du=tangent)
+    return replace(
+        neighbour,
+        value=state.mu[neighbour.name],
+        state=state,
+        tangent=tangent,
+        record=replace(record, point=point, scene=scene),
+    )
 
 
 def _judged(choice: Choice, coarse_solution: Solved, fine_solution: Solved) -> AdaptiveRound:
@@ -502,8 +553,8 @@ def _remeshed(
 ) -> Choice | None:
     """Return another mesh of the same degree with a given change of the error; collective.
 
-    Meridians, mesh files and grids are refined uniformly. Other surfaces get cells with equal
-    shares in the error.
+    Meridians and mesh files are refined uniformly. Other surfaces get cells with equal shares in
+    the error, and grids intervals between their lines.
 
     Parameters
     ----------
@@ -518,11 +569,11 @@ def _remeshed(
     (scene, _), degree = coarse_solution, choice.degree
     order = 2 * degree - 2  # of convergence of an energy
     problem = scene.problem
-    is_file_or_grid = problem.mesh_file or isinstance(problem.shape, Grid)
-    if problem.axisymmetric or is_file_or_grid:
+    if _is_refined_uniformly(problem, coarse_solution[1]):
         refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
-        if reduction < 1 and not scene.problem.axisymmetric:  # at least one more line of a grid
-            refinement_factor = max(refinement_factor, LINES)
+        if reduction < 1:
+            least_factor = MERIDIAN_FACTOR if problem.axisymmetric else GRID_FACTOR
+            refinement_factor = max(refinement_factor, least_factor)
         new_refinement = np.clip(choice.refinement * refinement_factor, COARSEST, FINEST)
         refinement = round(float(new_refinement), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
@@ -530,14 +581,29 @@ def _remeshed(
         return None
     centres, shares = indicators(coarse_solution, fine_solution)
     # sizes of elements over the surface, and the expected ratio of the numbers of cells
-    size, expected_ratio = equidistributed(
-        scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
-    )
+    size: Sampled | LineSpacing
+    if isinstance(grid := problem.shape, Grid):
+        lines = [grid.lines(axis, list(problem.points.values())) for axis in range(2)]
+        size, expected_ratio = equidistributed_lines(lines, centres, shares, order, reduction)
+    else:
+        size, expected_ratio = equidistributed(
+            problem.size, centres, shares, order, reduction, problem.material.h
+        )
     # the fine solution must fit too; twice its unknowns, since the ratio is an estimate
     fine_scene, _ = fine_solution
     if not _fits(fine_scene, 2 * fine_scene.model.system.dofs * expected_ratio):
         return None
     return Choice(degree, round(choice.refinement * expected_ratio**0.5, 3), size)
+
+
+def _is_refined_uniformly(problem: Problem, end: Ending) -> bool:
+    """Return whether a finer mesh has smaller cells everywhere.
+
+    It has on meridians, of mesh files, and on grids at an instability with a mode.
+    """
+    is_grid = isinstance(problem.shape, Grid)
+    is_mode_on_grid = is_grid and end.record is not None
+    return problem.axisymmetric or bool(problem.mesh_file) or is_mode_on_grid
 
 
 def _fits(scene: Scene, unknowns: float) -> bool:
