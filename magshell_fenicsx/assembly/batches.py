@@ -63,8 +63,8 @@ class EntityBatch:
     rule
         The quadrature that all of them share.
     geometry
-        (n, 3 sides): the covectors of the edge in the reference coordinates of each side (see
-        `shape_tables.edge_covector`), and the width of the cell of each side; (n, 0) for cells.
+        (n, 2 sides): the covectors of the edge in the reference coordinates of each side (see
+        `shape_tables.edge_covector`); (n, 0) for cells.
     """
 
     cells: tuple[NDArray[np.int32], ...]
@@ -226,10 +226,7 @@ def _edge_batches(
         edges = np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32)
         for chunk in _chunks(edges, len(rule.weights)):
             cells_of_sides = tuple(np.ascontiguousarray(side) for side in cells[chunk].T)
-            # by the edge's number in the cell on side 0
-            widths = edge_widths(V, cells_of_sides, np.full(len(chunk), kind[0]))
-            geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), widths])
-            yield EntityBatch(cells_of_sides, rule, geometry)
+            yield EntityBatch(cells_of_sides, rule, np.tile(covectors, (len(chunk), 1)))
 
 
 def _edge_quadrature(
@@ -289,38 +286,6 @@ def _corner(
     """
     first_corners = np.array(EDGES)[:, 0][edges]
     return np.asarray(compat.geometry_dofs(V.mesh)[cells, first_corners])
-
-
-def edge_widths(
-    V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
-) -> NDArray[np.float64]:
-    """Return the area of the cell on each side of an edge over the edge's length, (n, sides).
-
-    It is half the height of the triangle over the edge, in the flat mesh.
-
-    Parameters
-    ----------
-    cells
-        (n,) for each of the one or two sides.
-    edges
-        (n,): local numbers of the edge in the cell on side 0.
-    """
-    # for each side the places (n, 3, 3) of the corners of its cells
-    corners = [V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[side]] for side in cells]
-    areas = np.column_stack([_triangle_areas(places) for places in corners])
-    # both ends of each edge, as corners of the cell on side 0
-    first_corners, last_corners = np.array(EDGES)[edges].T
-    start, end = (
-        corners[0][np.arange(len(edges)), numbers] for numbers in (first_corners, last_corners)
-    )
-    length = np.linalg.norm(end - start, axis=1)
-    return np.asarray(areas / length[:, None])
-
-
-def _triangle_areas(places: Array) -> Array:
-    """Return the areas (n,) of triangles, from the places (n, 3, 3) of their corners."""
-    first_edge, second_edge = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
-    return np.asarray(np.linalg.norm(np.cross(first_edge, second_edge), axis=1) / 2)
 
 
 class Contraction:

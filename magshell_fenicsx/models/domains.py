@@ -1,13 +1,13 @@
 """Integration domains of a shell: its mid-surface, or the meridian of what is closed around e3.
 
 A domain gives the jets of fields, the measures of cells, of the edges between them and of the
-boundary's edges, and the widths of cells there. So an energy is written as its density alone.
+boundary's edges, and the areas of cells there. So an energy is written as its density alone.
 
 - A jet is a vector field's value with its first and second derivatives by two coordinates.
 - r0 is the placement (the undeformed surface), u the displacement, v an addition to it.
 - A covector m (2,) of an edge is zero along the edge and positive outward, in the coordinates of
-  jets. The width of a cell at an edge is half its height over it; the penalty of C0 elements has
-  those of both sides.
+  jets. The area of a cell at its edge, in the same coordinates, is per unit of the edge's
+  parameter; the penalty of C0 elements has those of both sides.
 - A wave varies as cos(m theta) or sin(m theta) around the axis e3.
 - r0 changes if an imperfection grows. Volumes are then counted from the initial placement.
 
@@ -194,8 +194,8 @@ class IntegrationDomain:
         Function from a field of the placement's space to its value and derivatives.
     covector
         Covector m (2,) of an edge.
-    width
-        Width of a cell at its edge.
+    cell_area
+        Area of a cell in the coordinates of jets, per unit of the parameter of its edge.
     rule, edge_rule, contact_rule
         Degrees of the quadrature on cells, along edges (None where these are points) and under
         contact.
@@ -214,7 +214,7 @@ class IntegrationDomain:
     r0: fem.Function
     jet: Callable[[Expr], Jet]
     covector: Expr
-    width: Expr
+    cell_area: Expr
     rule: int
     edge_rule: int | None
     contact_rule: int
@@ -315,19 +315,19 @@ class IntegrationDomain:
         """Return the value of a density at the displacement's jet u.
 
         With `from_initial` a density on cells counts the displacement from the initial placement.
-        On interior edges the density takes pairs of jets, covectors, widths and fields, '+' first.
+        On interior edges the density takes pairs of jets, covectors, areas and fields, '+' first.
         """
         r0 = self.j0
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
-            m, width = ((f("+"), f("-")) for f in (self.covector, self.width))
+            m, areas = ((f("+"), f("-")) for f in (self.covector, self.cell_area))
             # only fields differ on the two sides, constants do not
             sided = [
                 (p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters
             ]
-            return density.function(*pairs, m, width, *sided)
+            return density.function(*pairs, m, areas, *sided)
         if density.facets is not None:
-            return density.function(r0, u, self.covector, self.width, *density.parameters)
+            return density.function(r0, u, self.covector, self.cell_area, *density.parameters)
         return density.function(
             *(self.jets_from_initial(u) if from_initial else (r0, u)), *density.parameters
         )
@@ -382,7 +382,6 @@ def surface_domain(
         r0,
         lambda f: kin.jet(f, mesh_of_surface),
         kin.facet_covector(mesh_of_surface),
-        # area over length of the edge: half the height of a triangle
         ufl.CellVolume(mesh_of_surface) / ufl.FacetArea(mesh_of_surface),
         rule=cell_quadrature(degree),
         edge_rule=edge_quadrature(degree),
@@ -399,17 +398,13 @@ def meridian_domain(
     """Return the domain of a meridian, a mesh of intervals with the placement r0 = (rho, z)."""
     mesh_of_meridian = r0.function_space.mesh
     degree = r0.function_space.element.basix_element.degree
-    tangent = revolved_jet(r0).r1
-    width = (
-        ufl.CellVolume(mesh_of_meridian) / 2 * ufl.sqrt(ufl.dot(tangent, tangent))
-    )  # triangles have half their height
     return IntegrationDomain(
         r0,
         revolved_jet,
         ufl.as_vector(
             [ufl.FacetNormal(mesh_of_meridian)[0], 0]
         ),  # the length of an edge is then that per radian
-        width,
+        ufl.CellVolume(mesh_of_meridian) / 2,  # per radian, of a triangle
         rule=2 * degree
         + 2,  # one point more than the surface's: on the axis the densities are rational
         edge_rule=None,

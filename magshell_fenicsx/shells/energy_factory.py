@@ -288,7 +288,7 @@ class EnergyFactory:
         )
         v = fem.Function(self.u.function_space)
         jets = domain.j0, domain.jet(self.u), domain.jet(v)
-        arguments = *jets, domain.covector, domain.width, *density.parameters
+        arguments = *jets, domain.covector, domain.cell_area, *density.parameters
         energy = density.function(*arguments) * domain.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
@@ -704,8 +704,8 @@ def _per_coordinates(term: OwnTerm, density_function: Callable[..., Expr]) -> Ca
     if term.on is None:
         return per_area(density_function)
 
-    def on_edge(r0: Jet, u: Jet, m: Expr, width: Expr, *parameters: Expr) -> Expr:
-        # m: the edge's covector; the cell's width is for penalties, of which a term has none
+    def on_edge(r0: Jet, u: Jet, m: Expr, area: Expr, *parameters: Expr) -> Expr:
+        # m: the edge's covector; the cell's area is for penalties, of which a term has none
         edge = Edge.of(r0, m)
         return density_function(r0, u, edge, *parameters) * edge.stretch
 

@@ -624,11 +624,13 @@ def _work_on_interior_edges(
                 law.edge_stiffness(kin.membrane_strain(j, v), *edge),
             )
         )
-    widths = domain.width("+"), domain.width("-")
+    widths = [
+        edges.cell_width(r0s[i], domain.cell_area(sides[i]), conormals[i][2]) for i in range(2)
+    ]
     given_moment, moment, side_stiffness = (
         edges.mean_by_width(pair, widths) for pair in zip(*moments, strict=True)
     )
-    stiffness = side_stiffness * model.sigma / ((widths[0] + widths[1]) / 2)
+    stiffness = side_stiffness * model.sigma / (sum(widths) / 2)
     opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
     # length of the edge over its length in coordinates
     stretch = (conormals[0][2] + conormals[1][2]) / 2
@@ -653,7 +655,8 @@ def _works_on_held_edges(
     edge, law = (kin.inverse_metric(r0), (nu1, nu2), 1), _small_strain_law(model, r0)
     given_moment = law.edge_moment(*stresses.strain(r0, ""), *edge)
     moment = law.edge_moment(E, K, *edge)
-    stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.width
+    width = edges.cell_width(r0, domain.cell_area, stretch)
+    stiffness = law.edge_stiffness(E, *edge) * model.sigma / width
     works = []
     for held_edge in factory.held_edges:
         jump_of = _jump_of(held_edge, r0, m)

@@ -1,20 +1,16 @@
-"""Why an undeformed shell is unstable: the place of its lowest mode, and what is wrong there.
+"""Why an undeformed shell is unstable: the place of its lowest mode, and the penalty that helps.
 
 The undeformed shell has no stress, so that its energy has a minimum there. The energy of its finite
-elements has none where the interior penalty does not hold the moments at an edge, or where a curved
-triangle of a mesh is turned over in part.
+elements has none where the interior penalty does not hold the moments at an edge.
 """
 
 import numpy as np
-from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.batches import cell_batches
 from magshell_fenicsx.continuation.modes import ModesNotFound, lowest_modes
 from magshell_fenicsx.continuation.system import State, symmetric_part
 from magshell_fenicsx.mesh.patch import place_text
-from magshell_fenicsx.models.shell.energy import cell_quadrature
 from magshell_fenicsx.models.shell.parameters import default_penalty
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -24,15 +20,8 @@ PENALTY_FACTOR = 4.0  # by which a message asks for a larger penalty than the pr
 
 def cause_of_instability(scene: Scene, state: State) -> str:
     """Return in words why the undeformed shell is unstable, where, and what helps; collective."""
-    problem, model = scene.problem, scene.model
+    problem = scene.problem
     length, unit = problem.unit_of_places
-    if not (model.axisymmetric or problem.body):
-        cosine, centre = _most_turned_triangle(model.r0)
-        if cosine < 0:
-            return (
-                f"the curved triangle around {place_text(centre * length)}, {unit}, is turned over "
-                "in part: mend the mesh there"
-            )
     place = _place_of_lowest_mode(scene, state)
     around = "" if place is None else f" around {place_text(place * length)}, {unit}"
     cause = f"mesh.penalty is too small or the mesh too coarse{around}"
@@ -73,26 +62,3 @@ def _place_of_lowest_mode(scene: Scene, state: State) -> Array | None:
         place = np.array([place[0], 0.0, place[1]])
     all_ranks = model.system.comm.allgather((float(sizes[largest]), place))
     return np.asarray(max(all_ranks, key=lambda size_and_place: size_and_place[0])[1])
-
-
-def _most_turned_triangle(r0: fem.Function) -> tuple[float, Array]:
-    """Return the least cosine between normals of one triangle and their sum, and its centre (3,).
-
-    Normals are those at the points of the quadrature. Collective.
-    """
-    V = r0.function_space
-    nodes = r0.x.array.reshape(-1, 3)
-    least, centre = 1.0, np.zeros(3)
-    for batch in cell_batches(V, cell_quadrature(V.element.basix_element.degree)):
-        (cells,), (table,) = batch.cells, batch.rule.tables
-        jets = table.jets(nodes[V.dofmap.list[cells]])
-        n = np.cross(jets[:, :, 1], jets[:, :, 2])
-        n /= np.linalg.norm(n, axis=-1)[..., None]
-        total = n.sum(axis=1)
-        cosines = np.einsum("epi,ei->ep", n, total / np.linalg.norm(total, axis=-1)[:, None])
-        lowest = cosines.min(axis=1)
-        if len(cells) and lowest.min() < least:
-            cell = int(lowest.argmin())
-            least, centre = float(lowest[cell]), jets[cell, :, 0].mean(axis=0)
-    all_ranks = V.mesh.comm.allgather((least, centre))
-    return min(all_ranks, key=lambda cosine_and_centre: cosine_and_centre[0])

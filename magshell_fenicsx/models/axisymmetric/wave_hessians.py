@@ -289,7 +289,7 @@ class _WaveBatch:
             for phase in range(2):  # the cosine's and the sine's
                 wave_jets = [side_jets[phase] for side_jets in jets_of_waves]
                 W = W + _perturbed_density(
-                    energy.density, start, displacements, wave_jets, self._edge(r0), parameters
+                    energy.density, start, displacements, wave_jets, self._edge(), parameters
                 )
             kernels.append(full_hessian(f"{energy.name} waves", W, self._wave, self._log))
         return kernels
@@ -298,22 +298,18 @@ class _WaveBatch:
         """Return whether an energy counts from an initial placement other than r0."""
         return e.from_initial and self._domain.initial_placement is not None
 
-    def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], list[Expr]] | None:
-        """Return the covector and the width on every side of an edge; None in cells.
+    def _edge(self) -> tuple[list[Expr], list[Expr]] | None:
+        """Return the covector and the cell's area on every side of an edge; None in cells.
 
-        Here an edge is a circle, at a vertex of the meridian. The width is half the length of the
-        cell beside it, as triangles have half their height there. `r0` has the placement's jet on
-        every side.
+        Here an edge is a circle, at a vertex of the meridian. The area, per radian, is half of that
+        of the cell beside it, as it would be of a triangle.
         """
         density = self._energies[0].density  # all energies of a batch are on edges, or none
         if density is None or not density.on_edges:
             return None
         covectors = [ufl.as_vector([self._geometry[2 * side], 0]) for side in self._sides]
-        widths = [
-            self._geometry[2 * side + 1] / 2 * ufl.sqrt(ufl.dot(r0[side].r1, r0[side].r1))
-            for side in self._sides
-        ]
-        return covectors, widths
+        areas = [self._geometry[2 * side + 1] / 2 for side in self._sides]
+        return covectors, areas
 
     def _revolved_jets(self, field: fem.Function) -> list[Jet]:
         """Return the jets of an axisymmetric point field on each side of an entity."""
@@ -432,8 +428,8 @@ def _perturbed_density(
 
     A virtual work w(u, v) may have no potential; its derivative by u then is not symmetric. The
     quarter of w(u + v, v) - w(u - v, v) is quadratic in v and has the symmetric part as its
-    Hessian. All jets are given on every side; `edge` has the covectors and the widths, or is None
-    in cells.
+    Hessian. All jets are given on every side; `edge` has the covectors and the areas, or is None in
+    cells.
     """
     u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:

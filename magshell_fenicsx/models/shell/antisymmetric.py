@@ -23,7 +23,7 @@ from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.edges import edge_density
+from magshell_fenicsx.models.shell.edges import cell_width, edge_density
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.quantities.mode_labels import ANTISYMMETRIC
@@ -34,7 +34,7 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
     u: Jet,
     v: Jet,
     m: Expr,
-    width: Expr,
+    area: Expr,
     sigma: Expr,
     mirror: Expr,
     *,
@@ -44,7 +44,7 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
     """Half the energy of an edge on a mirror plane, for an antisymmetric addition v.
 
     One half of the shell has the displacement u + v, the other is the mirror image of a half with u
-    - v. `m` is the edge's covector, `width` that of the cells there, `sigma` the penalty and
+    - v. `m` is the edge's covector, `area` that of the cell there, `sigma` the penalty and
     `mirror` the unit normal of the plane. `natural` are the forms of the shape that the shell would
     have without stress; None for those of r0.
     """
@@ -73,9 +73,8 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
     (first_moment, stiffness), (second_moment, _) = (
         densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides
     )
-    return (
-        edge_density((first_moment + second_moment) / 2, stiffness, J, width, sigma) * stretch / 2
-    )
+    moment, width = (first_moment + second_moment) / 2, cell_width(r0, area, stretch)
+    return edge_density(moment, stiffness, J, width, sigma) * stretch / 2
 
 
 class AntisymmetricModes:

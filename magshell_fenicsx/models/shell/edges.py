@@ -14,13 +14,15 @@ cell is beside its neighbour, the same sigma holds its moment (docs/theory.md).
   b_nunu the curvature across the edge. M_nunu is the moment that works on it.
 - m is the covector (2,) of an edge (`kinematics.conormal`); an edge's parameter is its length in
   the coordinates, or a number from 0 to 1.
-- The `width` of a cell at an edge is half its height over it, h_e the mean of both sides; sigma is
-  the penalty, D a bending stiffness.
+- The width of a cell at an edge is half its height over it, h_e the mean of both sides; sigma is
+  the penalty, D a bending stiffness. `area` is that of a cell in its coordinates, per unit of the
+  edge's parameter, from which the width follows.
 - A natural shape (`Forms`) is the one that the shell would have without stress. Its `kink(nu)` is
   its curvature across an edge over the undeformed one, `along(nu)` the square of its stretch there.
 - A jet is a field's value with its first and second derivatives.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -45,6 +47,16 @@ FOLD_ANGLE = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
     """{M} J + sigma D/(2 h_e) J^2: moment M, penalty stiffness D, jump J, h_e the `width`."""
     return M * J + sigma * D / (2 * width) * J**2
+
+
+def cell_width(r0: Jet, area: Expr, stretch: Expr) -> Expr:
+    """Return the width of a cell at an edge: its area over the edge's length.
+
+    Both are those of a cell with the undeformed metric at the point. A flat triangle through the
+    corners may be far higher, where the curved one is low. `stretch` is the undeformed length of
+    the edge over its parameter.
+    """
+    return area * kin.area_ratio(r0) / stretch
 
 
 def fold_jump(
@@ -75,7 +87,7 @@ def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
     return -ufl.dot(ufl.cross(n_plus, n_minus), edge_tangent), ufl.dot(n_plus, n_minus)
 
 
-def mean_by_width(values: tuple[Expr, Expr], widths: tuple[Expr, Expr]) -> Expr:
+def mean_by_width(values: Sequence[Expr], widths: Sequence[Expr]) -> Expr:
     """Return the mean of the values on both sides of an edge, weighted by the cells' widths."""
     return (values[0] * widths[0] + values[1] * widths[1]) / (widths[0] + widths[1])
 
@@ -85,7 +97,7 @@ def two_sided(
     r0: Sides,
     u: Sides,
     m: tuple[Expr, Expr],
-    widths: tuple[Expr, Expr],
+    areas: tuple[Expr, Expr],
     sigma: Expr,
     *,
     law: tuple[Law, Law],
@@ -103,8 +115,8 @@ def two_sided(
         Jets on both sides, '+' first.
     m
         Covectors of the edge on both sides; see `kinematics.conormal`.
-    widths
-        Width of the cell on each side.
+    areas
+        Areas of the cells on both sides.
     sigma
         Penalty.
     law
@@ -120,8 +132,9 @@ def two_sided(
         densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i])
         for i in range(2)
     ]
+    widths = [cell_width(r0[i], areas[i], conormals[i][2]) for i in range(2)]
     M, D = (mean_by_width(pair, widths) for pair in zip(*moments, strict=True))
-    return edge_density(M, D, J, (widths[0] + widths[1]) / 2, sigma) * stretch
+    return edge_density(M, D, J, sum(widths) / 2, sigma) * stretch
 
 
 def interior(
@@ -135,7 +148,7 @@ def interior(
     """Energy of an interior edge between cells that meet smoothly, or nearly so.
 
     It is per unit of the edge's parameter. The jump of the normal stands for the angle, whose sine
-    it is. `rest` are the widths and sigma of `two_sided`.
+    it is. `rest` are the areas and sigma of `two_sided`.
     """
     # the two components of the conormal on each side
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
@@ -158,7 +171,7 @@ def fold(
 
     J is the change of the angle, whatever its size. A natural kink is the limit of a narrow bend:
     its strength of b_nunu is the angle times the natural stretch across the fold. `rest` are the
-    widths and sigma of `two_sided`.
+    areas and sigma of `two_sided`.
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
@@ -180,13 +193,13 @@ def fold(
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
-def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, reference_turn: Expr) -> Expr:
+def turning(r0: Jet, u: Jet, m: Expr, area: Expr, intensity: Expr, reference_turn: Expr) -> Expr:
     """Potential of a moment per length about an edge, per unit of the edge's parameter.
 
     It is -`intensity` times the angle of the normal about the undeformed tangent. The tangent runs
     with the surface on its left, so that a positive angle turns the normal outward. Only the
     normal's part across the tangent counts. `reference_turn` (2,) holds cosine and sine of the turn
-    from which the angle is counted, so that it may grow beyond pi. `width` is not used.
+    from which the angle is counted, so that it may grow beyond pi. `area` is not used.
     """
     edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))
@@ -199,7 +212,7 @@ def clamped(
     r0: Jet,
     u: Jet,
     m: Expr,
-    width: Expr,
+    area: Expr,
     sigma: Expr,
     turn: Expr | None = None,
     *,
@@ -209,8 +222,8 @@ def clamped(
     """Energy of a clamped edge, per unit of its parameter.
 
     The side '-' is rigid: its normal stays n0, or is `turn` n0 with a rotation (3, 3). There are
-    jets, covector, law and natural forms of one side only; `width` is that of its cells, `sigma`
-    the penalty.
+    jets, covector, law and natural forms of one side only; `area` is that of its cell, `sigma` the
+    penalty.
 
     The stiffness of rubber falls with the stretch: an edge that stretched by itself would turn
     freely. Where cells resolve the layer in which rubber bends, the penalty has the stiffness of
@@ -222,6 +235,7 @@ def clamped(
     held_normal = n0 if turn is None else ufl.dot(turn, n0)
     J = -ufl.dot(held_normal - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
+    width = cell_width(r0, area, stretch)
     if law.linear is not law:
         _, D_at_small_strains = densities.normal_moment(r0, u, nu1, nu2, law.linear, natural)
         resolves_layer = ufl.lt(width, WIDTH_OF_LAYER * law.h)
@@ -233,7 +247,7 @@ def symmetric(
     r0: Jet,
     u: Jet,
     m: Expr,
-    width: Expr,
+    area: Expr,
     sigma: Expr,
     mirror: Expr,
     *,
@@ -244,7 +258,7 @@ def symmetric(
 
     It is half of the energy of an interior edge whose side '-' is the mirror image of '+'. `mirror`
     is the unit normal of the plane. There are jets, covector, law and natural forms of one side
-    only; `width` is that of its cells, `sigma` the penalty.
+    only; `area` is that of its cell, `sigma` the penalty.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
@@ -254,7 +268,7 @@ def symmetric(
 
     J = mirror_jump(r0 + u) - (natural.kink(nu1, nu2) if natural else 1) * mirror_jump(r0)
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
-    return edge_density(M, D, J, width, sigma) * stretch / 2
+    return edge_density(M, D, J, cell_width(r0, area, stretch), sigma) * stretch / 2
 
 
 def largest_fold(r0: fem.Function, degree: int) -> float:

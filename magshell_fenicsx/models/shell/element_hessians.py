@@ -42,6 +42,7 @@ from magshell_fenicsx.models.shell.kinematics import Jet, strain_components
 PointTerm = ShellTerm | HessianTerm
 Array = NDArray[np.float64]
 JET_NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
+REFERENCE_AREA = 0.5  # of the triangle; an edge's parameter runs from 0 to 1
 DERIVATIVE_RANK = (
     2,
     0,
@@ -78,7 +79,7 @@ class HessianIntegral:
         The batches of interior edges, which couple two cells; else empty.
     _u, _r0, _geometry
         Point fields of one batch at a time: the jets of u and of r0 on all sides; the covector of
-        each side, then the width of the cell of each side.
+        each side.
     _placements
         The jets of r0 at the points of each batch.
     _kernels, _prestress
@@ -105,7 +106,7 @@ class HessianIntegral:
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
         self._points = PointStorage(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * JET_SIZE * sides) for _ in range(2))
-        self._geometry = self._points.field(3 * sides)
+        self._geometry = self._points.field(2 * sides)
         self._placements = Memo(
             lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
         )
@@ -285,7 +286,7 @@ class Kernel:
         u, r0
             Point fields with the jets of displacement and placement.
         geometry
-            Point field with the covectors (2,) on all sides, then the widths of the cells.
+            Point field with the covectors (2,) on all sides.
         sides
             Number of cells beside a point.
         """
@@ -295,10 +296,9 @@ class Kernel:
         z = self._points.field(3 * JET_SIZE) if of_v else u
         arguments = (r0, u, z) if of_v else (r0, u)
         jets = [_jets(field, sides) for field in arguments]
-        # on edges: the covector and the width of the cell on each side
+        # on edges: the covector on each side, and the area of the reference triangle
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
-        widths = [geometry[2 * sides + side] for side in range(sides)]
-        edge = (m, widths) if density.on_edges else None
+        edge = (m, [REFERENCE_AREA] * sides) if density.on_edges else None
         W = density.value_at(jets, edge, self._parameters)
         # W is then a virtual work w(u, v), linear in v. Half of its derivative by u along v is
         # quadratic in v, and has the symmetric part of that derivative as its Hessian.

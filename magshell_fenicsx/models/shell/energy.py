@@ -3,8 +3,8 @@
 - A density is an energy per area of the coordinates, or per unit of an edge's parameter, as a
   function of jets: a field's value with its first and second derivatives by two coordinates.
 - r0 is the placement, u the displacement, v a virtual displacement or an addition to u.
-- m is the covector (2,) of an edge: zero along it and positive outward. The width is that of a
-  cell at the edge.
+- m is the covector (2,) of an edge: zero along it and positive outward. The area is that of a
+  cell in the coordinates, per unit of the edge's parameter.
 - A side is one of the cells beside a point: two on an interior edge, else one.
 - A load without potential, as a live pressure, has a virtual work in place of an energy.
 - A term is an energy in a sum, multiplied by its amplitude: a load parameter, by name.
@@ -48,8 +48,8 @@ class Density:
     ----------
     function
         The density as a function: on cells of (r0, u, *parameters), per area of the coordinates; on
-        boundary edges of (r0, u, m, width, *parameters), see `edges`; on interior edges the same
-        with pairs of jets, covectors and widths.
+        boundary edges of (r0, u, m, area, *parameters), see `edges`; on interior edges the same
+        with pairs of jets, covectors and areas.
     parameters
         Numbers, or fields that vary over the surface; on interior edges `function` takes a field as
         a pair.
@@ -104,12 +104,12 @@ class Density:
             For each argument (r0, u, ...) its jets on every side. If there is a third one, v, a
             load without potential returns its virtual work along v; else the density is returned.
         edge
-            The covectors and the widths of all sides; None on cells.
+            The covectors and the areas of all sides; None on cells.
         parameters
             Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
-        # arguments in the order of `function`: jets, then on edges covectors and widths, each a
+        # arguments in the order of `function`: jets, then on edges covectors and areas, each a
         # pair of both sides, or the value of the only one; then parameters
         sided = [
             tuple(side_values) if self.sides == 2 else side_values[0]

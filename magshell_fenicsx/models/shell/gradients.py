@@ -74,9 +74,9 @@ class PointGradient:
     r0
         Jets (points, sides * parts * 3) of the placement, in the cells' own coordinates.
     geometry
-        (points, 4): p, q, s and the determinant of the cell's frame. On edges (points, 6 sides +
-        1): the frame of each side, the covectors (2,) of the edge in the sides' own coordinates,
-        and the widths of the cells.
+        (points, 4): p, q, s and the determinant of the cell's frame. On edges (points, 6
+        sides): the frame of each side, then the covectors (2,) of the edge in the sides' own
+        coordinates.
     values
         Function from a field that a density depends on to its values (points, components).
     log
@@ -257,7 +257,7 @@ def _energy(
         Point fields of r0 (in the cells' own coordinates), of u and perhaps of v (both in reference
         coordinates).
     point_geometry
-        Point field of the frames; on edges, then the covectors and widths of all sides.
+        Point field of the frames; on edges, then the covectors of all sides.
     parts
         Names of the jet parts in the fields.
     parameters
@@ -283,8 +283,8 @@ def _energy(
         ufl.as_vector([point_geometry[first + 2 * side], point_geometry[first + 2 * side + 1]])
         for side in sides
     ]
-    widths = [point_geometry[first + 2 * density.sides + side] for side in sides]
-    return density.value_at([r0_jets, *displacement_jets], (m, widths), parameters)
+    areas = [frame[-1] / 2 for frame in frames]  # of the flat cells; an edge runs from 0 to 1
+    return density.value_at([r0_jets, *displacement_jets], (m, areas), parameters)
 
 
 def _frame(point_geometry: fem.Function, side: int) -> list[Expr]:

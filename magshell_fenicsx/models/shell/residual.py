@@ -30,7 +30,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.batches import boundary_edges, edge_widths, interior_edges
+from magshell_fenicsx.assembly.batches import boundary_edges, interior_edges
 from magshell_fenicsx.assembly.free_parameters import FreeParameter
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.memo import Memo
@@ -485,8 +485,7 @@ def _points_on_edges(
     rows
         (points, sides) numbers of the points, counted cell by cell and edge by edge.
     geometry
-        (points, 7 sides): the frame of each side, the covector of each side, then the width of
-        the cell of each side.
+        (points, 6 sides): the frame of each side, then the covector of each side.
     """
     # cells and local numbers of the edges, (edges, sides) each; the second side may be reversed
     if density.facets is None:
@@ -509,7 +508,6 @@ def _points_on_edges(
     columns = [
         frames[cells].reshape(-1, FRAME_SIZE * density.sides),
         m.reshape(-1, 2 * density.sides),
-        edge_widths(V, tuple(cells.T), edges[:, 0]),
     ]
     geometry = np.repeat(np.concatenate(columns, axis=1), points_per_edge, axis=0)
     return rows.reshape(-1, density.sides), geometry

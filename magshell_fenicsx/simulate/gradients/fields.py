@@ -63,7 +63,6 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, AdjointState, e
 from magshell_fenicsx.simulate.gradients.shape import (
     of_measures,
     of_normals,
-    of_widths,
     rates,
 )
 from magshell_fenicsx.simulate.perturbation import expand_shell_contact
@@ -286,8 +285,8 @@ def _gradient_by_placement(
 ) -> Array:
     """Return the gradient (own cells, nodes, 3) of forms by the placement, at one place.
 
-    Beside the derivatives of forms it has those of the measures by which loads are divided, of the
-    widths of cells in penalties, and of normals at points. Collective.
+    Beside the derivatives of forms it has those of the measures by which loads are divided, and of
+    normals at points. Collective.
 
     Parameters
     ----------
@@ -301,8 +300,6 @@ def _gradient_by_placement(
     if model.thin:
         shares += of_measures(model, shares, w)
     gradient = derivatives_by_field(shares, r0, model.u, w, model.kernels)
-    if model.thin and (by_vertices := of_widths(model, shares, w)) is not None:
-        gradient[:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
     gradient += of_normals(adjoint, place, first=not number)
     return gradient
 

@@ -1,14 +1,13 @@
 """Derivatives by the drawn shape beside those by the placement that densities contain.
 
 A case with another deviation has other places and normals, and all that is said by them: remanence,
-thickness and natural shape by formulas, loads per area and length, those on an edge in all, and
-cells of another width. The derivative is the sum of those by the placement r0, by the width of the
-cells, and by each field f that follows from r0,
+thickness and natural shape by formulas, loads per area and length, and those on an edge in all. The
+derivative is the sum of those by the placement r0 and by each field f that follows from r0,
 
-    dJ/dw0 = n . (dJ/dr0 + dJ/dx) + dJ/df : df/dw0,
+    dJ/dw0 = n . dJ/dr0 + dJ/df : df/dw0,
 
 where df/dw0 are differences: f in a cell follows from the nodes of this cell alone, so that a node
-of all cells is moved at once. Cells are as wide as the flat triangles between their vertices x.
+of all cells is moved at once.
 
 Words and symbols:
 
@@ -30,10 +29,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.field_gradient import (
     WeightedTerm,
     broken_space,
-    derivatives_by_field,
 )
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField
 from magshell_fenicsx.parts.forces.load_vectors import by_vertex_normal
 from magshell_fenicsx.shells.meridian import MeridianModel
@@ -76,55 +73,6 @@ def of_measures(
         )
         measure_terms.append(WeightedTerm(measure, -load_value / measure_value, 0.0))
     return measure_terms
-
-
-def of_widths(
-    model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
-) -> Array | None:
-    """Return derivatives (cells, vertices, 3) by the vertices of flat cells; collective.
-
-    The penalty energies on edges contain the widths of flat cells (area over length of the edge),
-    which UFL takes from the mesh. So these are replaced by functions of a field of vertices, by
-    which the forms are differentiated. None of a meridian, or where no form has a width.
-
-    Parameters
-    ----------
-    shares
-        Terms with their weights in a gradient.
-    w
-        The vector along which residuals are taken.
-    """
-    if model.axisymmetric:  # widths of its cells are functions of the placement
-        return None
-    domain = model.V.mesh
-    vertices = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
-    vertices.interpolate(lambda places: places)
-    jet = kin.jet(vertices, domain)
-    # area of a cell and length of an edge: each is replaced by itself times its ratio as a function
-    # of the vertices, which is 1 where they are now
-    cell_area, edge_length = ufl.CellVolume(domain), ufl.FacetArea(domain)
-    *_, length_ratio = kin.conormal(jet, kin.facet_covector(domain))
-    moved_measures = {
-        cell_area: cell_area * kin.area_ratio(jet),
-        edge_length: edge_length * length_ratio,
-    }
-    widened_terms = list[WeightedTerm]()
-    for share in shares:
-        form = share.term.form
-        on_edges = any(integral.integral_type() != "cell" for integral in form.integrals())
-        if on_edges and (moved_form := ufl.replace(form, moved_measures)) != form:
-            widened_terms.append(
-                WeightedTerm(
-                    FormTerm(share.term.name, moved_form, model.u, model.kernels),
-                    share.energy,
-                    share.work,
-                )
-            )
-    return (
-        derivatives_by_field(widened_terms, vertices, model.u, w, model.kernels)
-        if widened_terms
-        else None
-    )
 
 
 def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array | float:
