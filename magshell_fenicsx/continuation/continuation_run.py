@@ -60,8 +60,6 @@ MAX_STEPS = 1000
 LOAD_TOLERANCE = 1e-8  # relative: of the amplitude at an instability
 # in lengths: distance up to which two branches that part at an imperfection pass near each other
 MAX_BRANCH_DISTANCE = 0.1
-# solves after which the middle of a fold's bracket is taken if two solves have not halved it
-SOLVES_BEFORE_BISECTION = 4
 # distance in the path's metric below which two folds are one
 SAME_FOLD_DISTANCE = 1e-2
 
@@ -483,13 +481,8 @@ class _InstabilityLocator:
             If a solve fails.
         """
         name = self.path.name
-        widths = list[float]()  # of the brackets so far
         for _ in range(MAX_TRIALS):
             s = _stationary_place(low, high, name, kink if self.base.across else stationary)
-            widths.append(abs(high.s - low.s))
-            # at a kink the cubic comes near from one side alone, in ever smaller steps
-            if len(widths) > SOLVES_BEFORE_BISECTION and widths[-1] > widths[-3] / 2:
-                s = (low.s + high.s) / 2
             point = self.solve(s, low, high)
             mu = point.state.mu[name]
             is_before = point.dmu * low.dmu > 0
@@ -766,8 +759,9 @@ class ContinuationRun:
         separated. Such a cluster counts as one instability, at the first of both points; its width
         is the error of the amplitude.
 
-    The private field `_folds` has the located folds, `_budget` the work on the next instability.
-    `_by_arc` tells whether s is the arc length.
+    The private field `_folds` has the located folds, `_budget` the work on the next instability,
+    `_counted_solves` the number of solves of the path up to the last search. `_by_arc` tells
+    whether s is the arc length.
     """
 
     def __init__(
@@ -785,7 +779,7 @@ class ContinuationRun:
         self.clusters: list[tuple[Point, Point]] = []
         self._folds: list[Point] = []
         self._budget = LocationBudget(path.options.max_location_solves)
-        self._solves_before_search = 0  # of the path, at the end of the last search that has failed
+        self._counted_solves = 0  # of the path, up to the last search
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
         """Yield pairs of a label and a point, in the order of the path.
@@ -1068,11 +1062,12 @@ class ContinuationRun:
         if is_beyond and not high.has_instability_since(low):
             budget.renew()  # shorter steps have passed the place: there was nothing on this path
         if budget.end:  # the steps since the last search
-            budget.solves += self.path.solves - self._solves_before_search
+            budget.solves += self.path.solves - self._counted_solves
+        self._counted_solves = self.path.solves
         try:
             yield from instabilities(self.path, low, high, budget=budget)
         except InstabilityNotLocated as e:
-            self._solves_before_search = self.path.solves
+            self._counted_solves = self.path.solves
             budget.apart = e if isinstance(e, BranchesApart) else None
             budget.end, budget.clustered = high, True
             if budget.apart:
@@ -1090,7 +1085,7 @@ class ContinuationRun:
             yield from self._located(base_behind, self.path.measured_from(base_behind, high))
         except PathStopped:
             budget.end, budget.clustered, budget.apart = high, False, None
-            self._solves_before_search = self.path.solves
+            self._counted_solves = self.path.solves
             raise
 
     def _pass_near(self, low: Point, high: Point) -> bool:

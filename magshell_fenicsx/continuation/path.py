@@ -564,7 +564,8 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        controller = StepController([start], self.options.first)
+        has_onsets = self.newton.options.has_onsets
+        controller = StepController([start], self.options.first, has_onsets)
         for target in targets:
             while (current := controller.current).s != target:
                 plan = self._plan(controller, target, step_end)

@@ -96,18 +96,25 @@ class StepController:
         The last points, from which the next one is extrapolated.
     step
         The length of the next step, unless something shortens it.
+    has_onsets
+        Whether contact forces begin within steps. Then a solve may be hard for what begins to
+        touch, however short its step is.
     leaps
         The number of failed steps since the last point; a few of them may be followed by leaps.
     rejected
         A solution that a step rejected as too far.
+    was_hard
+        Whether the last step had a hard solve.
     onset_without_solution
         The last point before an onset of forces, if no solution was found behind the onset.
     """
 
     points: list[Point]
     step: float
+    has_onsets: bool = False
     leaps: int = 0
     rejected: RejectedPoint | None = None
+    was_hard: bool = False
     onset_without_solution: Point | None = None
 
     @property
@@ -158,7 +165,10 @@ class StepController:
         self.leaps += 1
         # a longer step may pass a singular tangent
         leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
-        self.step = 2 * plan.length if leaps_over else plan.length / 2
+        # a step to a target or an onset is shorter: half of its length might end there again
+        tried = abs(plan.s - self.current.s)
+        length = min(tried, plan.length) if tried / 2 >= smallest else plan.length
+        self.step = 2 * plan.length if leaps_over else length / 2
         if not self.step >= smallest:
             raise PathStopped(reason, self.current)
 
@@ -189,8 +199,12 @@ class StepController:
             # not less than before: this step may have been short only to end at a target
             self.step = min(max(self.step, longer), options.largest)
         # a step to an onset says nothing about the length
-        elif point.factorisations >= options.hard_factorisations and plan.event.fraction == 1:
-            self.step = 0.6 * length
+        is_hard = point.factorisations >= options.hard_factorisations
+        if is_hard and not (straight and easy) and plan.event.fraction == 1:
+            # where a shorter step was hard as well, a still shorter one would be no easier
+            stays_hard = self.has_onsets and self.was_hard
+            self.step = length if stays_hard else 0.6 * length
+        self.was_hard = is_hard
         # at most three points before this one, and none before an onset or a kink
         smooth = plan.event.fraction == 1 and not kink
         earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
