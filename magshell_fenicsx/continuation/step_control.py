@@ -103,8 +103,8 @@ class StepController:
         The number of failed steps since the last point; a few of them may be followed by leaps.
     rejected
         A solution that a step rejected as too far.
-    was_hard
-        Whether the last step had a hard solve.
+    hard_step
+        Length and number of factorisations of the last step, if its solve was hard; else None.
     onset_without_solution
         The last point before an onset of forces, if no solution was found behind the onset.
     """
@@ -114,7 +114,7 @@ class StepController:
     has_onsets: bool = False
     leaps: int = 0
     rejected: RejectedPoint | None = None
-    was_hard: bool = False
+    hard_step: tuple[float, int] | None = None
     onset_without_solution: Point | None = None
 
     @property
@@ -201,14 +201,31 @@ class StepController:
         # a step to an onset says nothing about the length
         is_hard = point.factorisations >= options.hard_factorisations
         if is_hard and not (straight and easy) and plan.event.fraction == 1:
-            # where a shorter step was hard as well, a still shorter one would be no easier
-            stays_hard = self.has_onsets and self.was_hard
-            self.step = length if stays_hard else 0.6 * length
-        self.was_hard = is_hard
+            self.step = 0.6 * length if self._shortening_pays(length, point) else length
+        self.hard_step = (length, point.factorisations) if is_hard else None
         # at most three points before this one, and none before an onset or a kink
         smooth = plan.event.fraction == 1 and not kink
         earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
         self.points, self.leaps = [*earlier_points, point], 0
+
+    def _shortening_pays(self, length: float, point: Point) -> bool:
+        """Return whether a step shorter than the last one, which had a hard solve, may pay.
+
+        It does not where a shorter step has taken as much work per length as the hard step before:
+        what begins to touch in it makes its solve hard.
+
+        Parameters
+        ----------
+        length
+            The length of the last step in s.
+        point
+            The end of that step, with the work of its solve.
+        """
+        if not (self.has_onsets and self.hard_step):
+            return True
+        length_before, factorisations_before = self.hard_step
+        work, work_before = point.factorisations / length, factorisations_before / length_before
+        return length > length_before or work < work_before
 
     def accept_rejected(self, point: Point, length: float) -> None:
         """Append a solution that was rejected before, a step of a length from the last point."""
