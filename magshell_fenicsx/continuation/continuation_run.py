@@ -129,7 +129,8 @@ class LocationBudget:
         Whether the last search failed between several instabilities, or between two branches that
         pass near each other.
     apart
-        The two branches, where the last search ended between branches; None otherwise.
+        The two branches, where the last search ended between branches that pass near each other;
+        None otherwise.
     """
 
     max_solves: int
@@ -872,7 +873,7 @@ class ContinuationRun:
         if not refusal:
             return point, events, None, ""
         apart = self._budget.apart
-        if apart and self._budget.clustered and apart.point.s != low.s:
+        if apart and apart.point.s != low.s:
             end = self.path.as_base(apart.point)
             events, refusal_before = self._accepted_events(low, end)
             if not (refusal_before or self._renewed_step(low, end)):
@@ -1068,12 +1069,13 @@ class ContinuationRun:
             yield from instabilities(self.path, low, high, budget=budget)
         except InstabilityNotLocated as e:
             self._counted_solves = self.path.solves
-            budget.apart = e if isinstance(e, BranchesApart) else None
-            budget.end, budget.clustered = high, True
-            if budget.apart:
-                budget.end, budget.clustered = e.high, self._pass_near(e.point, e.high)
-            else:
+            budget.end, budget.clustered, budget.apart = high, True, None
+            if not isinstance(e, BranchesApart):
                 budget.repeated += 1
+            elif self._pass_near(e.point, e.high):
+                budget.end, budget.apart = e.high, e
+            else:
+                budget.clustered = False
             is_shortest = abs(step) / 4 < self.path.options.smallest
             may_repeat = budget.repeated <= MAX_REPEATED_SEARCHES and not budget.exhausted
             if not budget.clustered or (may_repeat and not is_shortest):
