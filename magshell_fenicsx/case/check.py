@@ -71,6 +71,8 @@ def _description(case: Case, problem: Problem) -> str:
     edges = _edges_without_potential(problem, patch) if problem.loads.pressure else ()
     if edges:
         left_out.append(no_potential(edges))
+        if case.mesh.tolerance is None:  # the tangent is skewed there, and takes more
+            memory_warning = refuse_beyond_memory(problem, skewed=True)
     if case.ensemble:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
     if case.design:

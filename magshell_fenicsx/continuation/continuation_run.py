@@ -14,7 +14,7 @@ displacement on which the amplitude does work.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -49,7 +49,6 @@ FOLD_SLOPE_RATIO = 0.01
 # places in a bracket, tried in turn, for a point between its ends
 MIDDLE_FRACTIONS = (0.5, 0.35, 0.65, 0.2, 0.8)
 MAX_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
-MAX_SOLVES = 60  # in the search for one instability, with its repetitions in shorter steps
 MAX_REPEATED_SEARCHES = 3  # in shorter steps, before several instabilities count as a cluster
 # in lengths: near a neutral mode rounding moves a state by less
 ROUNDING_NEAR_NEUTRAL_MODE = 1e-4
@@ -59,6 +58,8 @@ Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 MAX_STEPS = 1000
 LOAD_TOLERANCE = 1e-8  # relative: of the amplitude at an instability
+# in lengths: distance up to which two branches that part at an imperfection pass near each other
+MAX_BRANCH_DISTANCE = 0.1
 # distance in the path's metric below which two folds are one
 SAME_FOLD_DISTANCE = 1e-2
 
@@ -79,18 +80,35 @@ class Instability:
     kind: Literal["fold", "bifurcation"]
 
 
-class UnseparatedInstabilities(PathStopped):
-    """No solution was found between several instabilities, so they cannot be separated.
+class InstabilityNotLocated(PathStopped):
+    """An instability is known to lie between two points, and its place no better.
 
     Attributes
     ----------
     point, high
-        The last point before the instabilities, and the first point behind them.
+        The last point before it, and the first point behind it.
+    """
+
+    def __init__(self, reason: str, point: Point, high: Point) -> None:
+        super().__init__(reason, point)
+        self.high = high
+
+
+class UnseparatedInstabilities(InstabilityNotLocated):
+    """No solution was found between several instabilities, so they cannot be separated."""
+
+    def __init__(self, point: Point, high: Point) -> None:
+        super().__init__("several instabilities lie too close to each other", point, high)
+
+
+class BranchesApart(InstabilityNotLocated):
+    """Two points of a bracket lie on two branches, which pass each other without a meeting.
+
+    So they do beside a perturbed bifurcation: an imperfection parts the branches that cross at it.
     """
 
     def __init__(self, point: Point, high: Point) -> None:
-        super().__init__("several instabilities lie too close to each other", point)
-        self.high = high
+        super().__init__("the step jumped to another branch", point, high)
 
 
 @dataclass
@@ -99,29 +117,38 @@ class LocationBudget:
 
     Attributes
     ----------
+    max_solves
+        Number of solves after which an instability counts as located no better than its bracket.
     solves
-        Number of solves that were tried; at most `MAX_SOLVES` are allowed.
+        Number of solves that were tried: in searches, and on the steps from one search to the next.
     repeated
         Number of searches that ended between instabilities which they could not separate.
     end
         End of the step in which the last search failed; None if no search has failed.
     clustered
-        Whether the last search failed between several instabilities.
+        Whether the last search failed between several instabilities, or between two branches that
+        pass near each other.
+    apart
+        The two branches, where the last search ended between branches that pass near each other;
+        None otherwise.
     """
 
+    max_solves: int
     solves: int = 0
     repeated: int = 0
     end: Point | None = None
     clustered: bool = False
+    apart: BranchesApart | None = None
 
     @property
     def exhausted(self) -> bool:
         """Whether no further solve is allowed."""
-        return self.solves >= MAX_SOLVES
+        return self.solves >= self.max_solves
 
     def renew(self) -> None:
         """Reset all counts, for the search of the next instability."""
         self.solves, self.repeated, self.end, self.clustered = 0, 0, None, False
+        self.apart = None
 
 
 def instabilities(
@@ -151,8 +178,11 @@ def instabilities(
         If Newton's method fails between the two points.
     UnseparatedInstabilities
         If no point is found between several instabilities.
+    BranchesApart
+        If the two points prove to lie on different branches.
     """
-    locator = _InstabilityLocator(path, low, tolerance, budget or LocationBudget())
+    budget = budget or LocationBudget(path.options.max_location_solves)
+    locator = _InstabilityLocator(path, low, tolerance, budget)
     yield from locator.locate(low, path.relative_to(low, high), MAX_HALVINGS)
 
 
@@ -175,7 +205,7 @@ class _InstabilityLocator:
     path: Path
     base: Point
     tolerance: float
-    budget: LocationBudget = field(default_factory=LocationBudget)
+    budget: LocationBudget
     iterations: int = 0
     factorisations: int = 0
 
@@ -299,8 +329,9 @@ class _InstabilityLocator:
         The point; None if there is no such solution.
         """
         path = self.path
-        if path.newton.factorisation.skewed:
-            return None  # the regular system needs a symmetric tangent
+        # the regular system needs a symmetric tangent, and a bifurcation without imperfection
+        if path.newton.factorisation.skewed or self.budget.apart:
+            return None
         try:
             modes = [critical_mode(path.newton, end.state) for end in (low, high)]
         except NoEigenpair:
@@ -390,8 +421,8 @@ class _InstabilityLocator:
 
         Raises
         ------
-        PathStopped
-            If both ends prove to lie on different paths.
+        BranchesApart
+            If both ends prove to lie on different branches.
         """
         name = self.path.name
         for _ in range(MAX_TRIALS):
@@ -406,6 +437,8 @@ class _InstabilityLocator:
             else:
                 high = middle
             self.refuse_apart(low, high)
+            if not self.path.may_be_one_arc(low, high):
+                raise BranchesApart(low, high)
         width = abs(high.state.mu[name] - low.state.mu[name])
         return replace(self.with_work(low), load_error=width)
 
@@ -417,11 +450,11 @@ class _InstabilityLocator:
 
         Raises
         ------
-        PathStopped
+        BranchesApart
             If the points lie on different paths.
         """
         if self.path.are_apart(low, high, ROUNDING_NEAR_NEUTRAL_MODE):
-            raise PathStopped("the step jumped to another branch", low)
+            raise BranchesApart(low, high)
 
     def with_work(self, point: Point) -> Point:
         """Return a located point with the work that it took, and reset all counts of work."""
@@ -660,7 +693,8 @@ def locate_bifurcation(
     PathStopped
         If Newton's method fails between the two points, or no eigenpair is found.
     """
-    locator = _InstabilityLocator(path, stable, tolerance)
+    budget = LocationBudget(path.options.max_location_solves)
+    locator = _InstabilityLocator(path, stable, tolerance, budget)
     try:
         zero = locator.locate_zero_eigenvalue(stable, path.relative_to(stable, unstable), stability)
         return locator.with_own_inertia(zero)
@@ -726,8 +760,9 @@ class ContinuationRun:
         separated. Such a cluster counts as one instability, at the first of both points; its width
         is the error of the amplitude.
 
-    The private field `_folds` has the located folds, `_budget` the work on the next instability.
-    `_by_arc` tells whether s is the arc length.
+    The private field `_folds` has the located folds, `_budget` the work on the next instability,
+    `_counted_solves` the number of solves of the path up to the last search. `_by_arc` tells
+    whether s is the arc length.
     """
 
     def __init__(
@@ -744,7 +779,8 @@ class ContinuationRun:
         self.done = False
         self.clusters: list[tuple[Point, Point]] = []
         self._folds: list[Point] = []
-        self._budget = LocationBudget()
+        self._budget = LocationBudget(path.options.max_location_solves)
+        self._counted_solves = 0  # of the path, up to the last search
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
         """Yield pairs of a label and a point, in the order of the path.
@@ -772,10 +808,10 @@ class ContinuationRun:
                     shorter_step, new_reason = renewal
                     reason = new_reason or reason
                     break
-                # instabilities and targets in the step
-                events, refusal = self._accepted_events(low, point)
-                if refusal:  # approach in shorter steps
-                    shorter_step, reason = abs(point.s - low.s) / 4, refusal
+                # instabilities and targets in the step, which may end before its planned end
+                end, events, shorter_step, new_reason = self._end_of_step(low, point)
+                reason = new_reason or reason
+                if end is None:
                     break
                 for label, event, self.done in events:  # each tells whether it ends the run
                     yield label, event
@@ -785,18 +821,15 @@ class ContinuationRun:
                         self.points.append(event)
                         return
                 # the end of the step itself
-                self.points.append(point)
+                self.points.append(end)
                 has_all_points = self.goal.until == "points" and len(self.points) > self.goal.steps
                 self.done = not self._remaining_targets() or has_all_points
-                yield ("target" if is_target else "step"), point
-                if len(self.points) > self.goal.steps:
-                    if self.goal.until == "points":
-                        return
-                    raise PathStopped(
-                        f"{self.goal.steps} steps have not reached the {self.goal.until}",
-                        point,
-                        final=True,
-                    )
+                yield ("target" if is_target and end is point else "step"), end
+                if has_all_points:
+                    return
+                self._refuse_more_steps()
+                if shorter_step is not None:
+                    break
             if shorter_step is None:  # the path has reached its end
                 return
             if shorter_step < options.smallest:
@@ -806,6 +839,47 @@ class ContinuationRun:
             self.path = self.path.with_step_options(
                 replace(options, first=shorter_step, several=several)
             )
+
+    def _refuse_more_steps(self) -> None:
+        """Raise `PathStopped` if the run has taken as many steps as allowed."""
+        goal, last_point = self.goal, self.points[-1]
+        if len(self.points) > goal.steps:
+            message = f"{goal.steps} steps have not reached the {goal.until}"
+            raise PathStopped(message, last_point, final=True)
+
+    def _end_of_step(
+        self, low: Point, point: Point
+    ) -> tuple[Point | None, list[tuple[Label, Point, bool]], float | None, str]:
+        """Return where a step ends, with the events before.
+
+        A step over two branches that pass near each other ends before them: shorter steps find the
+        way from there.
+
+        Parameters
+        ----------
+        low, point
+            The begin of the step, and its planned end.
+
+        Returns
+        -------
+        end
+            The end; None if the step must be repeated in a shorter one.
+        events
+            For each event its label, its point, and whether it ends the run.
+        next_step
+            Length in s of the next step, and its reason; None and "" if steps go on as planned.
+        """
+        events, refusal = self._accepted_events(low, point)
+        if not refusal:
+            return point, events, None, ""
+        apart = self._budget.apart
+        if apart and apart.point.s != low.s:
+            end = self.path.as_base(apart.point)
+            events, refusal_before = self._accepted_events(low, end)
+            if not (refusal_before or self._renewed_step(low, end)):
+                next_step = max(abs(apart.high.s - end.s) / 4, self.path.options.smallest)
+                return end, events, next_step, refusal
+        return None, [], abs(point.s - low.s) / 4, refusal
 
     def _renewed_step(self, low: Point, point: Point) -> tuple[float, str] | None:
         """Replace the first of two points in `points`, if `renew` changes amplitudes there.
@@ -988,14 +1062,23 @@ class ContinuationRun:
         is_beyond = budget.end is not None and (high.s - budget.end.s) * step > 0
         if is_beyond and not high.has_instability_since(low):
             budget.renew()  # shorter steps have passed the place: there was nothing on this path
+        if budget.end:  # the steps since the last search
+            budget.solves += self.path.solves - self._counted_solves
+        self._counted_solves = self.path.solves
         try:
             yield from instabilities(self.path, low, high, budget=budget)
-        except UnseparatedInstabilities as e:
-            budget.end, budget.clustered = high, True
-            budget.repeated += 1
+        except InstabilityNotLocated as e:
+            self._counted_solves = self.path.solves
+            budget.end, budget.clustered, budget.apart = high, True, None
+            if not isinstance(e, BranchesApart):
+                budget.repeated += 1
+            elif self._pass_near(e.point, e.high):
+                budget.end, budget.apart = e.high, e
+            else:
+                budget.clustered = False
             is_shortest = abs(step) / 4 < self.path.options.smallest
             may_repeat = budget.repeated <= MAX_REPEATED_SEARCHES and not budget.exhausted
-            if may_repeat and not is_shortest:
+            if not budget.clustered or (may_repeat and not is_shortest):
                 raise
             budget.renew()
             yield self._cluster(e.point, e.high)
@@ -1003,8 +1086,19 @@ class ContinuationRun:
             base_behind = self.path.as_base(e.high)
             yield from self._located(base_behind, self.path.measured_from(base_behind, high))
         except PathStopped:
-            budget.end, budget.clustered = high, False
+            budget.end, budget.clustered, budget.apart = high, False, None
+            self._counted_solves = self.path.solves
             raise
+
+    def _pass_near(self, low: Point, high: Point) -> bool:
+        """Return whether two points on different branches are near each other.
+
+        Then the branches are those of a perturbed bifurcation. Where shells touch, branches part
+        for other reasons.
+        """
+        system, newton = self.path.system, self.path.newton
+        distance = max_abs(system.comm, high.state.u - low.state.u)
+        return not newton.options.has_onsets and distance < MAX_BRANCH_DISTANCE * system.length
 
     def _cluster(self, low: Point, high: Point) -> Instability:
         """Record the instabilities between two points as a cluster; return them as one instability.

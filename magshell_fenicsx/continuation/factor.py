@@ -63,6 +63,8 @@ class Factorisation:
         singular once less often.
     skewed
         Whether that tangent was a skewed one.
+    allow
+        Called before each factorisation on all ranks. It may raise an exception to stop the run.
 
     Private fields: of `_cholmod` and `_mumps` one is in use, as `_pc`. `_bordered` is the latest
     tangent, if it has a border, and `_border` the elimination of that. `_has_cholmod` and
@@ -86,6 +88,7 @@ class Factorisation:
         self._border: BlockElimination | None = None
         self._bordered: BorderedTangent | None = None
         self.skewed = False
+        self.allow: Callable[[], None] = lambda: None
 
     def factor(self, tangent: Tangent) -> None:
         """Factor a matrix; a bordered one by the factors of its K and k back-solves. Collective.
@@ -96,6 +99,7 @@ class Factorisation:
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other
             than the matrix.
         """
+        self.allow()
         # the tangent without its border: K or K + N
         inner = tangent.K if isinstance(tangent, BorderedTangent) else tangent
         self.skewed = isinstance(inner, SkewedTangent)

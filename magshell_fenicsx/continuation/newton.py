@@ -45,7 +45,7 @@ from magshell_fenicsx.continuation.system import (
     dot,
     max_abs,
 )
-from magshell_fenicsx.platform.interrupt import is_interrupt
+from magshell_fenicsx.platform.interrupt import first_cause
 
 # successive stiffnesses of touching faces, over the final ones; the first is about that of a shell
 STIFFNESS_FRACTIONS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -260,9 +260,8 @@ class BorderedNewton:
         try:
             snes.solve(None, self._x)
         except PETSc.Error as e:
-            if is_interrupt(e):
-                raise KeyboardInterrupt from None
-            raise
+            # the error of a callback, such as an interrupt, hides behind PETSc's own
+            raise first_cause(e) from None
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
         converged = code > 0
         u, mu = callbacks.split(self._x)

@@ -87,6 +87,9 @@ MAX_ESTIMATE_CORRECTION = 0.01  # in lengths: the single correction of an estima
 # one path
 MAX_DISTANCE_RATIO = 3.0
 ZERO_DISPLACEMENT = 1e-6  # in lengths: smaller displacements count as zero
+# two points are on different branches if their tangents leave this fraction of their distance
+# unexplained; points that are nearer, in lengths, may differ by rounding
+MAX_UNEXPLAINED_BY_ARC, MIN_DISTANCE_OF_BRANCHES = 0.5, 1e-3
 
 
 class NotANumber(RuntimeError):
@@ -125,6 +128,8 @@ class Path:
         The system that `newton` solves.
     metric
         The inner product and norm of directions (du, dmu), which define arc length.
+    solves
+        Number of solves so far, also of those that failed.
 
     The private field `_hard_solves` counts solves that failed or took many factorisations,
     `_successive_failures` solves that failed one after the other. They decide how later solves are
@@ -146,7 +151,7 @@ class Path:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
-        self._hard_solves = 0
+        self.solves = self._hard_solves = 0
         self._successive_failures = 0
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
         self._step_event = step_event
@@ -302,6 +307,7 @@ class Path:
         needs_inertia
             Whether the numbers of unstable directions of the point must be valid.
         """
+        self.solves += 1
         point = self.recorded(
             lambda: self._newton_point(
                 row, s, guess, stress, neighbour, max_step=max_step, needs_inertia=needs_inertia
@@ -558,7 +564,8 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        controller = StepController([start], self.options.first)
+        has_onsets = self.newton.options.has_onsets
+        controller = StepController([start], self.options.first, has_onsets)
         for target in targets:
             while (current := controller.current).s != target:
                 plan = self._plan(controller, target, step_end)
@@ -840,12 +847,7 @@ class Path:
         Their cosine must be large enough, and the mean of both tangents times the change of s must
         be nearly the displacement of the step.
         """
-        chord = next_point.state.u - current.state.u
-        # the displacement of the step less that by the trapezoidal rule, from both tangents
-        unexplained = chord - (next_point.s - current.s) / 2 * (current.du + next_point.du)
-        gap, distance = (
-            max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
-        )
+        gap, distance = self._gap_of_arc(current, next_point)
         is_straight = self._cosine(current, next_point) >= self.options.min_cosine
         return is_straight and gap <= max(self.options.max_gap * distance, ZERO_DISPLACEMENT)
 
@@ -910,6 +912,40 @@ class Path:
         reach = MAX_DISTANCE_RATIO * abs(high.s - low.s) * speed
         distance = max_abs(comm, high.state.u - low.state.u)
         return distance > max(reach, rounding * self.system.length)
+
+    def _gap_of_arc(self, low: Point, high: Point) -> tuple[float, float]:
+        """Return how much of the way between two points their tangents do not explain, in lengths.
+
+        Returns
+        -------
+        gap
+            The displacement between the points, less that by the trapezoidal rule.
+        distance
+            The displacement itself.
+        """
+        chord = high.state.u - low.state.u
+        unexplained = chord - (high.s - low.s) / 2 * (low.du + high.du)
+        gap, distance = (
+            max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
+        )
+        return gap, distance
+
+    def may_be_one_arc(self, low: Point, high: Point) -> bool:
+        """Return whether the tangents of two points allow one arc between them, however curved.
+
+        They do not if, by the trapezoidal rule, they leave most of the displacement from one point
+        to the other unexplained, which is larger than by rounding. Where contact forces begin the
+        result is True: a path with kinks has any tangents.
+
+        Parameters
+        ----------
+        high
+            The second point, whose tangent is per unit of s measured as for `low`.
+        """
+        if self.newton.options.has_onsets:
+            return True
+        gap, distance = self._gap_of_arc(low, high)
+        return distance < MIN_DISTANCE_OF_BRANCHES or gap < MAX_UNEXPLAINED_BY_ARC * distance
 
     def _is_explained_by_kink(self, current: Point, next_point: Point) -> bool:
         """Return whether a path with one kink somewhere between two points joins them.

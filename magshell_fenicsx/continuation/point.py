@@ -222,6 +222,9 @@ class StepOptions:
         counts as a jump too.
     several
         The longest step that may pass more than one instability; 0: an eighth of the first.
+    max_location_solves
+        Number of solves, in the search for one instability and on the shorter steps towards it,
+        after which it counts as located between the two points that are known.
     """
 
     first: float
@@ -234,6 +237,7 @@ class StepOptions:
     min_cosine: float = 0.5
     max_gap: float = 0.1
     several: float = 0.0
+    max_location_solves: int = 60
 
     @property
     def max_step_past_several(self) -> float:

@@ -96,18 +96,25 @@ class StepController:
         The last points, from which the next one is extrapolated.
     step
         The length of the next step, unless something shortens it.
+    has_onsets
+        Whether contact forces begin within steps. Then a solve may be hard for what begins to
+        touch, however short its step is.
     leaps
         The number of failed steps since the last point; a few of them may be followed by leaps.
     rejected
         A solution that a step rejected as too far.
+    hard_step
+        Length and number of factorisations of the last step, if its solve was hard; else None.
     onset_without_solution
         The last point before an onset of forces, if no solution was found behind the onset.
     """
 
     points: list[Point]
     step: float
+    has_onsets: bool = False
     leaps: int = 0
     rejected: RejectedPoint | None = None
+    hard_step: tuple[float, int] | None = None
     onset_without_solution: Point | None = None
 
     @property
@@ -158,7 +165,10 @@ class StepController:
         self.leaps += 1
         # a longer step may pass a singular tangent
         leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
-        self.step = 2 * plan.length if leaps_over else plan.length / 2
+        # a step to a target or an onset is shorter: half of its length might end there again
+        tried = abs(plan.s - self.current.s)
+        length = min(tried, plan.length) if tried / 2 >= smallest else plan.length
+        self.step = 2 * plan.length if leaps_over else length / 2
         if not self.step >= smallest:
             raise PathStopped(reason, self.current)
 
@@ -189,12 +199,33 @@ class StepController:
             # not less than before: this step may have been short only to end at a target
             self.step = min(max(self.step, longer), options.largest)
         # a step to an onset says nothing about the length
-        elif point.factorisations >= options.hard_factorisations and plan.event.fraction == 1:
-            self.step = 0.6 * length
+        is_hard = point.factorisations >= options.hard_factorisations
+        if is_hard and not (straight and easy) and plan.event.fraction == 1:
+            self.step = 0.6 * length if self._shortening_pays(length, point) else length
+        self.hard_step = (length, point.factorisations) if is_hard else None
         # at most three points before this one, and none before an onset or a kink
         smooth = plan.event.fraction == 1 and not kink
         earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
         self.points, self.leaps = [*earlier_points, point], 0
+
+    def _shortening_pays(self, length: float, point: Point) -> bool:
+        """Return whether a step shorter than the last one, which had a hard solve, may pay.
+
+        It does not where a shorter step has taken as much work per length as the hard step before:
+        what begins to touch in it makes its solve hard.
+
+        Parameters
+        ----------
+        length
+            The length of the last step in s.
+        point
+            The end of that step, with the work of its solve.
+        """
+        if not (self.has_onsets and self.hard_step):
+            return True
+        length_before, factorisations_before = self.hard_step
+        work, work_before = point.factorisations / length, factorisations_before / length_before
+        return length > length_before or work < work_before
 
     def accept_rejected(self, point: Point, length: float) -> None:
         """Append a solution that was rejected before, a step of a length from the last point."""

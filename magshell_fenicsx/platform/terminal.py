@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from types import FrameType
 
 Say = Callable[[str], None]
@@ -22,7 +23,8 @@ ERASE_LINE = "\r\x1b[K"
 RESERVED_COLUMNS = 3
 
 LINE_COLUMNS = 79  # of a line that stays, in the narrowest usual terminal
-STATUS_SECONDS = 30.0  # without a line, after which a pipe gets one
+# without a line, after which a pipe gets one: the longest silence is ten seconds
+STATUS_SECONDS = 9.0
 POLL_FRACTION = 0.1  # of that, between two checks whether it is time
 output_failures: list[str] = []  # why standard output is not written
 
@@ -88,7 +90,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     """Yield two functions of a line: one prints it, the other shows it as the status line.
 
     In plain output the second one prints a line only after STATUS_SECONDS without one, and again
-    after as many more. The status line is erased after `with`, and when SIGTERM ends the process.
+    after as many more. On a terminal, a status that has stayed for so long says for how long. The
+    status line is erased after `with`, and when SIGTERM ends the process.
 
     Parameters
     ----------
@@ -101,16 +104,26 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
         yield from _plain_output(say)
         return
     status_line = ""
+    status = LatestStatus()
+    lock = threading.Lock()  # the thread of `repeated` writes too
 
     def stay(line: str) -> None:
-        write(f"{ERASE_LINE}{line}\n{status_line}")
+        with lock:
+            write(f"{ERASE_LINE}{line}\n{status_line}")
 
     def rewrite(line: str) -> None:
         """Show a line of parts, separated by two spaces, as far as it fits, as the status line."""
         nonlocal status_line
         columns = max(0, shutil.get_terminal_size().columns - RESERVED_COLUMNS)
-        status_line = fit_to_columns(line.split("  "), columns)
-        write(f"{ERASE_LINE}{status_line}")
+        with lock:
+            status_line = fit_to_columns(line.split("  "), columns)
+            write(f"{ERASE_LINE}{status_line}")
+
+    def show(line: str) -> None:
+        """Note a status, and show it."""
+        status.note(line)
+        status.shown_at = status.noted_at
+        rewrite(line)
 
     def end(number: int, frame: FrameType | None) -> None:
         """Erase the status line, and let the earlier handler of the signal end the process."""
@@ -120,7 +133,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
 
     previous_handler = signal.signal(signal.SIGTERM, end)
     try:
-        yield stay, rewrite
+        with repeated(status, rewrite):
+            yield stay, show
     finally:
         signal.signal(signal.SIGTERM, previous_handler)
         write(ERASE_LINE)
@@ -131,36 +145,65 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
 
     The second is for statuses. A thread repeats the last status while nothing else is printed.
     """
-    last = time.monotonic()  # time of the last line
-    status = "", 0.0  # last status and its time
-    lock, ended = threading.Lock(), threading.Event()
+    status = LatestStatus()
+    lock = threading.Lock()  # the thread prints too
 
     def stay(line: str) -> None:
-        nonlocal last
-        with lock:  # the thread prints too
-            last = time.monotonic()
+        with lock:
+            status.shown_at = time.monotonic()
             say(line)
 
     def seldom(line: str) -> None:
         """Note a status, and print it if no line was printed for STATUS_SECONDS."""
-        nonlocal status
-        status = line, (time_now := time.monotonic())
-        if time_now - last >= STATUS_SECONDS:
+        status.note(line)
+        if status.noted_at - status.shown_at >= STATUS_SECONDS:
             stay(line)
 
+    with repeated(status, stay):
+        yield stay, seldom
+
+
+@dataclass
+class LatestStatus:
+    """The last status of a run, and when something was shown last.
+
+    Attributes
+    ----------
+    line
+        The status; empty before the first.
+    noted_at, shown_at
+        When it was noted, and when a line or status was shown last, by `time.monotonic`.
+    """
+
+    line: str = ""
+    noted_at: float = 0.0
+    shown_at: float = field(default_factory=lambda: time.monotonic())
+
+    def note(self, line: str) -> None:
+        """Note a status."""
+        self.line, self.noted_at = line, time.monotonic()
+
+
+@contextmanager
+def repeated(status: LatestStatus, show: Say) -> Iterator[None]:
+    """Show the last status again and again while nothing else is shown, until the end of `with`.
+
+    A thread does so, each time with how long the status has stayed.
+    """
+    ended = threading.Event()
+
     def repeat() -> None:
-        """Print the last status again and again while nothing else is printed, until the end."""
         with suppress(BrokenPipeError):  # which ends the program where it prints next
             while not ended.wait(POLL_FRACTION * STATUS_SECONDS):
-                line, status_time = status
                 time_now = time.monotonic()
-                if line and time_now - last >= (1 - POLL_FRACTION) * STATUS_SECONDS:
-                    stay(f"{line}  (for {time_now - status_time:.0f} s)")
+                is_due = time_now - status.shown_at >= (1 - POLL_FRACTION) * STATUS_SECONDS
+                if status.line and is_due:
+                    show(f"{status.line}  (for {time_now - status.noted_at:.0f} s)")
 
     repeating = threading.Thread(target=repeat, daemon=True)
     repeating.start()
     try:
-        yield stay, seldom
+        yield
     finally:
         ended.set()
         repeating.join()

@@ -21,6 +21,8 @@ BYTES_PER_UNKNOWN = {2: 1.0e3, 3: 1.1e3, 4: 1.3e3, 5: 1.65e3}
 BYTES_PER_UNKNOWN_OF_SOLID = 0.7e3
 # parts that are added: for the symmetry-breaking modes of a half, and past an instability
 SYMMETRY_BREAKING_SHARE, INDEFINITE_SHARE = 0.6, 0.7
+# degree -> ratio of the bytes with factors of a skewed tangent K + N beside those of K
+SKEWED_RATIO = {2: 1.7, 3: 1.8, 4: 1.9, 5: 2.0}
 UNKNOWNS_PER_TRIANGLE = 1.5  # over the square of the degree
 UNKNOWNS_PER_SOLID_LAYER = 36  # of three hexahedra of degree 2, for a layer of nodes
 
@@ -50,6 +52,7 @@ class MemoryEstimate:
         unknowns: float,
         *,
         half: bool = False,
+        skewed: bool = False,
         ranks: int = 1,
         local_ranks: int = 1,
     ) -> "MemoryEstimate":
@@ -59,19 +62,21 @@ class MemoryEstimate:
         ----------
         half
             Whether a half or a sector is modelled.
+        skewed
+            Whether the tangent is skewed, as beside an edge where a live pressure has no potential.
         ranks, local_ranks
             The processes of the run, and those of them on this machine.
         """
+        # a degree that was not measured counts as the highest
+        degree = min(degree_of(context), max(BYTES_PER_UNKNOWN))
+        bytes_per_unknown = BYTES_PER_UNKNOWN[degree]
         if context.solid:
             bytes_per_unknown = BYTES_PER_UNKNOWN_OF_SOLID
-        else:  # a degree that was not measured counts as the highest
-            bytes_of_highest_degree = BYTES_PER_UNKNOWN[max(BYTES_PER_UNKNOWN)]
-            bytes_per_unknown = BYTES_PER_UNKNOWN.get(degree_of(context), bytes_of_highest_degree)
         model_bytes = bytes_per_unknown * unknowns * log(max(unknowns, 2.0)) * local_ranks / ranks
         # a half also factors the tangent of its symmetry-breaking modes
-        min_bytes = BYTES_PER_PROCESS * local_ranks + model_bytes * (
-            1 + SYMMETRY_BREAKING_SHARE * half
-        )
+        models = 1 + SYMMETRY_BREAKING_SHARE * half
+        factors = SKEWED_RATIO[degree] if skewed else 1.0
+        min_bytes = BYTES_PER_PROCESS * local_ranks + model_bytes * models * factors
         return cls(unknowns, min_bytes, min_bytes + INDEFINITE_SHARE * model_bytes)
 
     def words(self, free_bytes: float) -> str:
@@ -93,13 +98,17 @@ def unknowns_of(context: Context, cells: float) -> float:
     return cells * (UNKNOWNS_PER_TRIANGLE * degree_of(context) ** 2)
 
 
-def refuse_beyond_memory(problem: Problem, ranks: int = 1, local_ranks: int = 1) -> str | None:
+def refuse_beyond_memory(
+    problem: Problem, ranks: int = 1, local_ranks: int = 1, *, skewed: bool = False
+) -> str | None:
     """Refuse a problem that needs more memory than is free.
 
     Parameters
     ----------
     ranks, local_ranks
         The processes of the run, and those of them on this machine.
+    skewed
+        Whether the tangent is known to be skewed, which takes the mesh to know.
 
     Returns
     -------
@@ -119,6 +128,7 @@ def refuse_beyond_memory(problem: Problem, ranks: int = 1, local_ranks: int = 1)
         problem.context,
         problem.unknowns,
         half=problem.is_half,
+        skewed=skewed,
         ranks=ranks,
         local_ranks=local_ranks,
     )

@@ -1,6 +1,7 @@
 """Run a case: follow its programme, write every accepted point, summarise.
 
-A signal or a time limit stops a run between two solves or two steps in time.
+A signal or a time limit stops a run between two solves or two steps in time; a signal also within a
+solve, before it factors the next tangent.
 
 A scene is the model of a problem with its solver. A record is a point of the path, with the scene
 that it belongs to; a row has its columns of path.csv. The journal, or checkpoint, keeps the result
@@ -100,6 +101,8 @@ class Watch:
 
     Attributes
     ----------
+    follows_path
+        Whether a path is followed: then a signal also stops a solve, for which nothing is written.
     _comm, _start, _limit
         The parameters of these names.
     _signals
@@ -116,6 +119,7 @@ class Watch:
         is_main_thread = threading.current_thread() is threading.main_thread()
         self._signals = SIGNALS if signals and is_main_thread else ()
         self._reason: str | None = None
+        self.follows_path = False
 
     def __enter__(self) -> Self:
         """Let signals be recorded until the end of `with`, but for those that are ignored."""
@@ -162,6 +166,18 @@ class Watch:
         limit = self._limit if limited else None
         if limit is not None and time.perf_counter() - self._start >= limit:
             self._reason = self._reason or f"the time limit of {limit:g} s"
+        self._raise_request()
+
+    def check_within_solve(self) -> None:
+        """Raise `Interrupted` within a solve of the path, if a signal asks for it; collective.
+
+        A time limit lets each solve end, so that a run that is resumed again and again gets on.
+        """
+        if self.follows_path:
+            self._raise_request()
+
+    def _raise_request(self) -> None:
+        """Raise `Interrupted` on all ranks if one has a reason to stop; collective."""
         # of the first rank that has one, so that all ranks raise together
         reason = next(filter(None, self._comm.allgather(self._reason)), None)
         if reason:
@@ -375,6 +391,8 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
     with output.watch:
         # `_follow` sets the journal of the files when they are opened, at the first point
         scene.journal = StoppableJournal(NoJournal(), output.watch)
+        scene.newton.factorisation.allow = output.watch.check_within_solve
+        output.watch.follows_path = True
         try:
             _follow(result, files, output, progress)
             _conclude(result, say)
@@ -382,6 +400,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interruption, result.stopped = e, str(e)
+        output.watch.follows_path = False
         if files and folder:
             interruption = _write_results(result, files, folder, output, progress, interruption)
     # the reason of an interruption, and how to go on where a journal has been written

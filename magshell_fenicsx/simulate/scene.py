@@ -212,8 +212,7 @@ class Scene:
             )
         self.problem, self.comm = problem, comm
         on_first_rank(comm, check_compiler)
-        warnings = (*self.problem.warnings, beyond_memory(self.problem, comm))
-        self.warnings = [warning for warning in warnings if warning]
+        memory_warning = beyond_memory(self.problem, comm)
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:
             self.model = build_meridian_model(self.problem)
@@ -221,6 +220,10 @@ class Scene:
             self.model = build_solid_model(self.problem, comm)
         else:
             self.model = build_model(self.problem, comm)
+        if self.problem.loads.pressure and self.model.without_potential:
+            memory_warning = beyond_memory(self.problem, comm, skewed=True)
+        warnings = (*self.problem.warnings, memory_warning)
+        self.warnings = [warning for warning in warnings if warning]
         self._examine_supports()
         self.newton = BorderedNewton(self.model.system, self._newton_options())
         self.journal: SolverJournal = NoJournal()
@@ -606,11 +609,16 @@ class Scene:
         return next((unit for unit in units if unit is not None), 0.0)
 
 
-def beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
+def beyond_memory(problem: Problem, comm: MPI.Comm, *, skewed: bool = False) -> str | None:
     """Return a warning if a problem comes near the machine's memory, else None; collective.
 
     Every rank asks its own machine. If one of them has too little memory, all ranks raise the same
     error.
+
+    Parameters
+    ----------
+    skewed
+        Whether the tangent is known to be skewed.
 
     Raises
     ------
@@ -618,13 +626,13 @@ def beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
         If the problem needs more memory than a machine has.
     """
     if comm.size == 1:
-        return refuse_beyond_memory(problem)
+        return refuse_beyond_memory(problem, skewed=skewed)
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks_of_machine = machine.size
     machine.Free()
     outcome: str | CaseError | None
     try:
-        outcome = refuse_beyond_memory(problem, comm.size, ranks_of_machine)
+        outcome = refuse_beyond_memory(problem, comm.size, ranks_of_machine, skewed=skewed)
     except CaseError as e:
         outcome = e
     outcomes = comm.allgather(outcome)

@@ -219,6 +219,7 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
         # the journal goes on with the unknowns of the new model
         scene.journal.begin(new_scene.model.V)
         new_scene.journal, new_scene.progress = scene.journal, scene.progress
+        new_scene.newton.factorisation.allow = scene.newton.factorisation.allow
         return new_scene
     raise Stopped(f"no model has the mode {mode}: {first_reason}")
 

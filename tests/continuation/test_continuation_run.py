@@ -334,3 +334,46 @@ def test_two_paths_of_an_imperfect_pitchfork_hold_no_instability_between_them() 
     with pytest.raises(PathStopped, match="another branch"):
         list(instabilities(path, *ends))
     assert newton.factorisation.count - before < 400
+
+
+def along_imperfect_column(
+    imperfection: float, stiffening: float, goal: ContinuationGoal, max_solves: int = 60
+) -> ContinuationRun:
+    newton = BorderedNewton(pitchfork(imperfection, stiffening))
+    options = StepOptions(0.03, 1.5, 3e-7, max_location_solves=max_solves)
+    path = Path(newton, "load", "arc", options)
+    start = path.start(State(np.array([0.0, imperfection]), {"load": 0.0}))
+    return ContinuationRun(path, start, goal)
+
+
+def test_the_fold_of_a_perturbed_bifurcation_is_found_between_two_branches() -> None:
+    """Koiter's fold at 1 - 3 (imperfection/2)^(2/3), where the perfect column would bifurcate at 1:
+    the step has jumped to the other branch, from which it is not located."""
+    imperfection = 1e-6
+    walk = along_imperfect_column(imperfection, -0.5, ContinuationGoal("limit"))
+    *_, (label, point) = walk
+    assert label == "fold"
+    assert point.state.mu["load"] == pytest.approx(1 - 3 * (imperfection / 2) ** (2 / 3), rel=1e-8)
+    assert walk.path.solves < 35
+    assert not walk.clusters
+
+
+def test_the_stable_branch_of_a_perturbed_bifurcation_is_followed() -> None:
+    """v^3 + (1 - load) v = 1e-7 has a stable path to any load, which turns sharply at 1."""
+    walk = along_imperfect_column(1e-7, 1.0, ContinuationGoal("target", [1.6]))
+    labels = [label for label, _ in walk]
+    assert "bifurcation" not in labels
+    assert walk.points[-1].negative_pivots == 0
+
+
+def test_a_search_that_may_not_go_on_tells_what_it_knows() -> None:
+    """After so many solves the last point before the instability stands for it, with the width that
+    is left as its error."""
+    imperfection = 1e-6
+    walk = along_imperfect_column(imperfection, -0.5, ContinuationGoal("limit"), max_solves=4)
+    *_, (label, point) = walk
+    assert label == "bifurcation"
+    fold = 1 - 3 * (imperfection / 2) ** (2 / 3)
+    load = point.state.mu["load"]
+    assert load < fold < load + point.load_error < load + 0.1
+    assert walk.path.solves < 20

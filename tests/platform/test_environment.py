@@ -93,6 +93,50 @@ def test_estimates(
         assert measured is None or estimated / 1e9 == pytest.approx(measured, rel=0.15)
 
 
+@pytest.mark.parametrize(
+    ("degree", "unknowns", "half", "measured"),
+    [
+        (2, 32_130, False, 0.769),
+        (4, 34_176, False, 1.133),
+        (2, 16_449, True, 0.635),
+        (4, 17_223, True, 0.922),
+        (3, 36_036, False, 0.996),
+        (2, 71_250, False, 1.434),
+        (2, 62_619, True, 1.931),
+        (2, 56_163, True, 2.23),
+    ],
+)
+def test_estimates_of_skewed_tangents(
+    degree: int, unknowns: int, half: bool, measured: float
+) -> None:
+    """Against the peaks of paths of cylinders with a free edge under a live pressure, in GB."""
+    case = ms.Case.load(DIMPLE, [f"mesh.degree={degree}"])
+    found = MemoryEstimate.for_unknowns(case.context, unknowns, half=half, skewed=True)
+    assert found.min_bytes / 1e9 == pytest.approx(measured, rel=0.15)
+
+
+def test_a_live_pressure_beside_a_free_edge_takes_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`check` and `run` know it once there is a mesh; a dead pressure has a symmetric tangent."""
+    case = tmp_path / "case.yaml"
+    case.write_text(
+        "shell: {geometry: cylinder, radius: 1, length: 2, thickness: 0.01, youngs_modulus: 1, "
+        "poisson_ratio: 0.3}\n"
+        "boundary: {bottom: clamped}\n"
+        "symmetry: none\n"
+        "loading: {kind: pressure, until: target, control: load, pressure: 1e-8, points: 1}\n"
+        "mesh: {degree: 2, refinement: 0.7}\n"
+    )
+    monkeypatch.setenv("MAGSHELL_MEMORY", "0.3")
+    closed = magshell("check", case, "--set", "boundary.top=clamped")
+    assert (closed.returncode, closed.stderr) == (0, "")
+    for command in (("check", case), ("run", case, "--out", tmp_path / "out")):
+        done = magshell(*command)
+        assert done.returncode == 2
+        assert "of memory, and 0.3 GB are free: lower mesh.refinement" in done.stderr
+
+
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_model_that_is_too_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str

@@ -81,6 +81,26 @@ def test_signal(
     check_goes_on(out, reference)
 
 
+def test_a_signal_within_a_solve(
+    tmp_path: Path, reference: Path, no_pictures: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a large shell a solve takes minutes: it ends before the next tangent is factored."""
+    checks, own_check = list[None](), Watch.check_within_solve
+
+    def check(watch: Watch) -> None:
+        checks.append(None)
+        if len(checks) == 8:
+            signal.raise_signal(signal.SIGTERM)
+        own_check(watch)
+
+    monkeypatch.setattr(Watch, "check_within_solve", check)
+    out = tmp_path / "out"
+    done = magshell("run", *LONG, "--out", out)
+    assert (done.returncode, len(checks)) == (3, 8)
+    assert "stopped early: interrupted by SIGTERM" + GOES_ON.format(out=out) in done.stderr
+    check_goes_on(out, reference)
+
+
 @pytest.mark.slow
 def test_stiff_motion(tmp_path: Path) -> None:
     """A row that would take hours ends at the next step in time, by a signal to one rank or the

@@ -82,7 +82,7 @@ def test_a_field_bends_a_strip_onto_a_bar() -> None:
     assert label == "target"
     assert end["force"] > 0
     assert 0 < end["penetration_over_h"] < 1e-3
-    assert len(passed) < 40, "it does not creep"
+    assert len(passed) < 10, "it does not creep"
 
 
 ARCH: dict[str, Any] = {
@@ -104,7 +104,7 @@ def test_a_plate_flattens_half_a_ring() -> None:
     forces = [seen["force"] for label, seen in passed if label == "target"]
     assert len(forces) == 4
     assert np.all(np.diff(forces) > 0)
-    assert len(passed) < 30, "it does not creep"
+    assert len(passed) < 15, "it does not creep"
 
 
 HOLE: dict[str, Any] = {
