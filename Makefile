@@ -19,7 +19,7 @@ make extremes         shells far from the ordinary ones into docs/extremes/: 5 m
 make noise            every case under relative noise into docs/noise/: an hour on one core (ARGS="--seeds 3")
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
-make effectivity      estimated errors over true ones, as a table: 10 minutes
+make effectivity      estimated errors over true ones, as a table: half an hour
 make studies          error against run time of two cases into docs/study/: 10 minutes
 make test             lint and the tests that are not marked slow: 10 minutes on two cores
                       (TESTS="tests/simulate ...": of these folders; MARK=slow, MARK=telling: those so marked;
