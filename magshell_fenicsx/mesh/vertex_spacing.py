@@ -22,8 +22,8 @@ MAX_GROUP_WIDTH = 0.2  # over the element size: places farther apart have grid l
 MIN_DIGITS, MAX_DIGITS = 4, 17  # significant digits of a number in a message
 TEXT_PRECISION = 0.05  # relative error of the difference of two places in a message
 # `flatness` times the degree squared, beyond which rounding hides the stiffness of a plate: with
-# elements of a quarter to a tenth of its length, Newton's method fails at 5000 to 20 000
-MAX_FLATNESS = 6000.0
+# elements of a quarter to a tenth of its length, Newton's method fails from 11 000 to 31 000
+MAX_FLATNESS = 9000.0
 SHORT_SIDE = 0.05  # a side over another one, below which messages tell its ends
 
 

@@ -257,9 +257,9 @@ def of_file(file: Path, **mesh: Any) -> Case:
     return Case.from_source(data | {"symmetry": "none"})
 
 
-@pytest.mark.parametrize("width", [1e-3, 2e-4])
+@pytest.mark.parametrize("width", [1e-3, 1e-4])
 def test_flat_triangles_of_a_file(tmp_path: Path, width: float) -> None:
-    """Beside triangles 200 and 1000 times as high the end rises by F L^3/(3 D b), a beam's, 1e-4;
+    """Beside triangles 200 and 2000 times as high the end rises by F L^3/(3 D b), a beam's, 1e-4;
     the first had unstable directions, of the second the clamped shell was said not to be held."""
     scene = Scene(of_file(columns(tmp_path / "a.msh", width)))
     *_, last = follow(scene)
@@ -270,9 +270,9 @@ def test_flat_triangles_of_a_file(tmp_path: Path, width: float) -> None:
 
 def test_a_triangle_too_flat_for_rounding(tmp_path: Path) -> None:
     """It was said that the clamped shell is not held."""
-    problem = make_problem(of_file(columns(tmp_path / "a.msh", 1e-4)))
+    problem = make_problem(of_file(columns(tmp_path / "a.msh", 5e-5)))
     with pytest.raises(
-        MeshError, match=r"shell.file: the triangle .* \(0.4001, 0.[12], 0\) and \(0.4, 0.[12], 0\)"
+        MeshError, match=r"shell.file: the triangle .* \(0.40005, 0.[12], 0\) and \(0.4, 0.[12], 0\)"
     ):
         problem.triangulated()
 
