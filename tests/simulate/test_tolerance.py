@@ -254,7 +254,7 @@ def test_equal_shares_between_lines() -> None:
     x, y = np.meshgrid(middles, middles[: n // 2])
     centres = np.column_stack([x.ravel(), y.ravel()])
     shares = np.exp(3 * centres[:, 0])
-    spacing, more = equidistributed_lines([lines, lines], centres, shares, order, 0.5)
+    spacing, more = equidistributed_lines([lines, lines], centres, shares, order, 0.5, 0.0)
     along, across = (n * np.array([spacing(axis, place) for place in middles]) for axis in range(2))
     step = 2 ** (1 / 8)  # distances are rounded to it
     assert np.ptp(3 * middles + (order + 1) * np.log(along)) < (order + 1) * np.log(step) * 1.5
