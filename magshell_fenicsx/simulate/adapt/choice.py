@@ -81,7 +81,12 @@ class LineSpacing:
 
 
 def equidistributed_lines(
-    lines: Sequence[Array], centres: Array, shares: Array, order: float, reduction: float
+    lines: Sequence[Array],
+    centres: Array,
+    shares: Array,
+    order: float,
+    reduction: float,
+    least_distance: float,
 ) -> tuple[LineSpacing, float]:
     """Return distances of lines for which the intervals between them have equal shares.
 
@@ -95,6 +100,8 @@ def equidistributed_lines(
         Power of the size in the error.
     reduction
         Wanted error over the error on the old grid.
+    least_distance
+        Least distance, as `least_ratio` of `equidistributed`.
 
     Returns
     -------
@@ -121,7 +128,10 @@ def equidistributed_lines(
         common = min(common, 1 / (GRID_FACTOR * min(change.min() for change in changes)))
     changes = [2 ** (np.round(STEPS * np.log2(change * common)) / STEPS) for change in changes]
     middles = tuple((each[1:] + each[:-1]) / 2 for each in lines)
-    distances = tuple(np.diff(each) * change for each, change in zip(lines, changes, strict=True))
+    distances = tuple(
+        np.maximum(np.diff(each) * change, least_distance)
+        for each, change in zip(lines, changes, strict=True)
+    )
     factor_of_cells = float(np.prod([np.mean(1 / change) for change in changes]))
     return LineSpacing(middles, distances), factor_of_cells
 

@@ -17,7 +17,7 @@ Words and symbols:
 - Cuts and penalties are the settings of contact between shells, kept as entries of `State.mu`.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import basix
@@ -548,7 +548,8 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
         # cuts and penalties of shells that touch change until they are fit
         state_with_own_contact = with_own_contact(scene, end.state)
         if state_with_own_contact is None:
-            return end
+            # nodes of supports that move are there, so that the end can be carried on
+            return replace(end, state=scene.model.system.with_moved_supports(end.state))
         guess, tangent = state_with_own_contact, end.tangent
     return None
 

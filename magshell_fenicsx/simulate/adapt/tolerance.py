@@ -2,11 +2,13 @@
 path.
 
     (a) Compute the whole path on a coarse mesh of degree 3. (b) Compute its end with one degree
-    more; the change of the result estimates the error. (c) Stop if the estimate is at most the
-    tolerance, and on a surface at least a fifth of it. (d) If it is larger, and the degree is below
-    the one that suits the tolerance, continue with (b) with one degree more. (e) Else make a mesh
-    on which all cells have equal shares in the error (`indicators`) and the expected error is 0.55
-    of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
+    more; the change of the result estimates the error. If changes by two degrees in sequence have a
+    large ratio, as where there is a point force, all further ones of a geometric series are added.
+    (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of it. (d)
+    If it is larger, and the degree is below the one that suits the tolerance, continue with (b)
+    with one degree more. (e) Else make a mesh on which all cells have equal shares in the error
+    (`indicators`) and the expected error is 0.55 of the tolerance; compute its end by Newton's
+    method from the end of (b); continue with (b).
 
 Meridians are refined uniformly, where cells cost nothing. Of grids, whose lines go from edge to
 edge, the lines are placed such that the intervals between them have equal shares. On a meridian and
@@ -30,6 +32,7 @@ Words and symbols:
 
 from collections.abc import Callable
 from dataclasses import replace
+from math import inf
 
 import basix
 import numpy as np
@@ -90,6 +93,7 @@ COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
 # least factor of the refinement of a meridian, where cells cost less than another round; contact
 # makes the error fall slowly
 MERIDIAN_FACTOR = 1.5
+MAX_RATIO = 0.5  # of the changes of the result by two degrees in sequence
 MIN_CELLS_TO_COARSEN = 50  # a surface with at most so many cells is not coarsened
 Solved = tuple[Scene, Ending]
 
@@ -403,6 +407,9 @@ def rounds(
     highest_degree = max(choice.degree, _fastest_degree(tolerance))
     most_rounds = MOST_ROUNDS + highest_degree - choice.degree
     tried_rounds: list[tuple[AdaptiveRound, Choice]] = []
+    # the change of the result by one degree less, and the factor by which a sequence of changes in
+    # this ratio is more than its first one
+    change_below, series = inf, 1.0
     while True:
         doing(
             f"a mesh for the tolerance {tolerance:g}: round {len(tried_rounds) + 1}, degree "
@@ -410,7 +417,10 @@ def rounds(
         )
         fine_choice = replace(choice, degree=choice.degree + 1)
         fine_solution = transferred(problem, fine_choice, coarse_solution)
-        round_result = _judged(choice, coarse_solution, fine_solution)
+        change = estimated(coarse_solution[1].value, fine_solution[1].value)
+        if change_below < inf:
+            series = 1 / (1 - min(change / change_below, MAX_RATIO))
+        round_result = _judged(choice, coarse_solution, series * change)
         tried_rounds.append((round_result, choice))
         say(f"tolerance {tolerance:g}{suffix}: {_words_of_round(round_result)}")
         # A mesh far better than the tolerance is made coarser. A meridian need not: it is cheap.
@@ -420,7 +430,7 @@ def rounds(
             break
         # first up to the degree that suits the tolerance: the fine solution has one degree more
         if round_result.estimate > tolerance and choice.degree < highest_degree:
-            choice, coarse_solution = fine_choice, fine_solution
+            choice, coarse_solution, change_below = fine_choice, fine_solution, change
             continue
         next_choice = _remeshed(
             choice,
@@ -435,6 +445,7 @@ def rounds(
             f"{next_choice.degree}, solving"
         )
         choice, coarse_solution = next_choice, transferred(problem, next_choice, fine_solution)
+        change_below = inf
     best, choice = _best_round(tried_rounds, tolerance)
     is_within = best.estimate <= tolerance
     if not is_within:
@@ -529,10 +540,9 @@ def _instability_near_by(scene: Scene, source: Scene, neighbour: Ending) -> Endi
     )
 
 
-def _judged(choice: Choice, coarse_solution: Solved, fine_solution: Solved) -> AdaptiveRound:
-    """Return the round of a mesh, with its error by a solution of one degree more."""
-    (scene, coarse_end), (_, fine_end) = coarse_solution, fine_solution
-    estimate = estimated(coarse_end.value, fine_end.value)
+def _judged(choice: Choice, coarse_solution: Solved, estimate: float) -> AdaptiveRound:
+    """Return the round of a mesh, with the estimated relative error of its result."""
+    scene, coarse_end = coarse_solution
     return AdaptiveRound(
         choice.degree,
         choice.refinement,
@@ -584,7 +594,9 @@ def _remeshed(
     size: Sampled | LineSpacing
     if isinstance(grid := problem.shape, Grid):
         lines = [grid.lines(axis, list(problem.points.values())) for axis in range(2)]
-        size, expected_ratio = equidistributed_lines(lines, centres, shares, order, reduction)
+        size, expected_ratio = equidistributed_lines(
+            lines, centres, shares, order, reduction, problem.material.h
+        )
     else:
         size, expected_ratio = equidistributed(
             problem.size, centres, shares, order, reduction, problem.material.h
