@@ -167,7 +167,8 @@ class StepController:
         leaps_over = reason == HIDDEN_BY_ROUNDING and self.leaps <= MAX_LEAPS
         # a step to a target or an onset is shorter: half of its length might end there again
         tried = abs(plan.s - self.current.s)
-        length = min(tried, plan.length) if tried / 2 >= smallest else plan.length
+        is_shorter = 2 * smallest <= tried < BELOW_ONE * plan.length
+        length = tried if is_shorter else plan.length
         self.step = 2 * plan.length if leaps_over else length / 2
         if not self.step >= smallest:
             raise PathStopped(reason, self.current)
