@@ -66,11 +66,11 @@ SLOPE_STEP = 1e-4  # relative change of a load, for the slope of an eigenvalue a
 ROUNDING = 1e-13  # dimensionless numbers as small as this are zero
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
-NO_EQUILIBRIUM = "with one degree more Newton's method finds no equilibrium"
 OTHERS_FIRST = (
     "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
     "too coarse"
 )
+NO_EQUILIBRIUM = "with one degree more Newton's method finds no equilibrium"
 
 
 class NotEstimated(RuntimeError):
