@@ -70,11 +70,11 @@ MIN_COSINE = 0.5  # between a mode and the same mode with one degree more
 LATER = "limit_load_"  # before the number of an instability after the first
 LATER_TAKE_LONG = "this and later instabilities have no estimate, as it would take long"
 MOST_INSTABILITIES = 4  # of a path on a meridian, whose errors are estimated
-NO_EQUILIBRIUM = "with one degree more Newton's method finds no equilibrium"
 OTHERS_FIRST = (
     "with one degree more other modes are unstable there: the load is off by far, as the mesh is "
     "too coarse"
 )
+NO_EQUILIBRIUM = "with one degree more Newton's method finds no equilibrium"
 
 
 class NotEstimated(RuntimeError):
