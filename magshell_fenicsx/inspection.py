@@ -112,7 +112,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         read_case = with_same_files(Case.from_source(source), world())
         # only now: the solver takes long to import
         from magshell_fenicsx.case.check import describe
-        from magshell_fenicsx.public import problem_of
+        from magshell_fenicsx.case.open_problem import problem_of
         from magshell_fenicsx.simulate.perfect import with_modes
 
         problem = with_modes(problem_of(read_case, world()), world())

@@ -207,10 +207,16 @@ class Model(Scene):
         self.read_functions()
         return mass(self.model)
 
-    def energies(self) -> dict[str, float]:
-        """Return the energy of each term by name; that of a load for the amplitude 1."""
+    def energies(self, state: State | None = None) -> dict[str, float]:
+        """Return group of terms -> energy over E h R^2 of the whole shell.
+
+        Parameters
+        ----------
+        state
+            Another state than the present one.
+        """
         self.read_functions()
-        return self.model.system.energies(self.state.u, self._state.mu)
+        return super().energies(state or self.state)
 
     def solve(self) -> Record:
         """Find the equilibrium at the amplitudes that are set, and put the model there.

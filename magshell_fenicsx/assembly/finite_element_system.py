@@ -198,7 +198,7 @@ class FiniteElementSystem:
     @property
     def fixed_unknowns(self) -> NDArray[np.int32]:
         """This rank's own unknowns that are zero or move with a support."""
-        return self._fixed
+        return np.asarray(self._fixed, dtype=np.int32)
 
     def with_number(self, name: str, number: SettableNumber, value: float) -> "FiniteElementSystem":
         """Return the same system with one more number of its terms that a state may set.

@@ -165,9 +165,10 @@ def trace(  # noqa: PLR0913
         If the path is lost, or there is no equilibrium to start from.
     """
     if isinstance(scene, Record):
-        if scene.scene is None:
+        record = scene
+        if record.scene is None:
             raise ValueError("trace: this record comes from another process: give a model as well")
-        scene, start = scene.scene, start or scene
+        scene, start = record.scene, start or record
     scene.read_functions()
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)

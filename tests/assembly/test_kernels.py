@@ -11,9 +11,9 @@ from dolfinx import fem
 from magshell_fenicsx.assembly import kernels
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointStorage, point_values
+from magshell_fenicsx.case.open_problem import problem_of
 from magshell_fenicsx.continuation.system import SkewedTangent, State
 from magshell_fenicsx.platform import compat, disk_cache
-from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.simulate.scene import Scene
 
 CAP = {

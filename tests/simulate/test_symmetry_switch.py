@@ -12,6 +12,7 @@ from command import magshell, read_path
 from numpy.typing import NDArray
 from simulate.tube_by_ritz import koiter
 
+from magshell_fenicsx.case.open_problem import problem_of
 from magshell_fenicsx.continuation import bifurcation
 from magshell_fenicsx.continuation.control import PrescribedConjugate
 from magshell_fenicsx.continuation.modes import critical_mode, nearest_to_zero
@@ -19,7 +20,6 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.mesh.unfolding import ChartUnfolding
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
-from magshell_fenicsx.public import problem_of
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.shells.shell import ShellModel
