@@ -6,7 +6,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from continuation.toys import column_of_modes
+from continuation.toys import column_of_modes, pitchfork
 
 from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -38,3 +38,22 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
         "are too close to be located one by one"
     )
     assert point.state.mu["load"] == first < 1 < last
+
+
+def test_a_fold_that_no_step_resolves_is_told_between_two_branches() -> None:
+    """Koiter's fold at 1 - 3 (1e-6/2)^(2/3), beside the branch of the perfect column."""
+    newton = BorderedNewton(pitchfork(1e-6, stiffening=-0.5))
+    path = Path(newton, "load", "arc", StepOptions(0.03, 1.5, 0.01))
+    start = path.start(State(np.array([0.0, 1e-6]), {"load": 0.0}))
+    walk = ContinuationRun(path, start, ContinuationGoal("limit"))
+    *_, (label, point) = walk
+    ((low, high),) = walk.clusters
+    first, last = (end.state.mu["load"] for end in (low, high))
+    assert cluster_remark(WITHOUT_UNITS, walk, point) == (
+        f"an instability between load = {first:.6g} and load = {last:.6g} cannot be located more "
+        "closely: an imperfection parts the branches there, and they pass too near each other"
+    )
+    assert (label, low) == ("bifurcation", point)
+    assert first < 1 - 3 * (1e-6 / 2) ** (2 / 3) < last < first + 0.01
+    assert point.load_error == pytest.approx(last - first)
+    assert path.solves < 30
