@@ -29,12 +29,14 @@ from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import SkewedTangent, State, Vector
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.shells.mass import mass
-from magshell_fenicsx.shells.modes import ShellModes
+from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
+from magshell_fenicsx.simulate.contact_control import with_own_contact
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.trace import Amount, number_of_amount
 
 SMALLEST_LOAD_STEP = 2.0**-8  # of the way from the last solution to the loads that are set
+MAX_CONTACT_SOLVES = 12  # with changed stiffnesses and cuts of shells that touch
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ class Mode:
         "" for a mode of the model; "m = 7" or "antisymmetric" for one that a model reduced by
         symmetry does not have.
     u
-        The mode, with phi . M phi = 1 over the model's mass; None where `label` is not empty.
+        The mode, with phi . M phi = 1 over the model's mass; None of a mode that the model does not
+        have.
     """
 
     omega2: float
@@ -109,9 +112,15 @@ class Model(Scene):
         if self._u is not None:
             has_changed = not np.array_equal(self._u.x.array, self._values_of_u)
             if self.comm.allreduce(has_changed, MPI.LOR):
-                self._state = State(self.unknowns_of(self._u), self._state.mu)
+                self._state = self._supported(State(self.unknowns_of(self._u), self._state.mu))
                 self._values_of_u = self._u.x.array.copy()
         return self._state
+
+    def _supported(self, state: State) -> State:
+        """Return a state with its supports where they are: a program may have moved them."""
+        system = self.model.system
+        held_state = State(system.zero_at_supports(state.u), state.mu)
+        return system.with_moved_supports(held_state)
 
     def _show(self, state: State) -> None:
         """Give the function `u` the values of a state; the first call makes it."""
@@ -133,7 +142,10 @@ class Model(Scene):
 
     @property
     def held(self) -> NDArray[np.int32]:
-        """Numbers of this rank's unknowns that supports hold or move."""
+        """Numbers of this rank's unknowns that supports hold or move.
+
+        Supports in an oblique direction hold sums of unknowns, which are not among them.
+        """
         return self.model.system.fixed_unknowns
 
     def set(self, **amplitudes: Amount) -> None:
@@ -170,7 +182,7 @@ class Model(Scene):
             If it is of another model.
         """
         if isinstance(state, PETSc.Vec):
-            state = State(np.array(state.array_r), self._state.mu)
+            state = self._supported(State(np.array(state.array_r), self._state.mu))
         if isinstance(state, Record):
             state = state.point.state
         self.refuse_foreign(state)
@@ -227,8 +239,9 @@ class Model(Scene):
         Returns
         -------
         Record
-            The equilibrium with its number of unstable directions, for `columns`, `picture`,
-            `trace` and others.
+            The equilibrium, for `columns`, `picture`, `trace` and others. It counts the unstable
+            directions of the model itself; `modes` has those that a model reduced by symmetry
+            excludes.
 
         Raises
         ------
@@ -237,7 +250,7 @@ class Model(Scene):
         """
         self.read_functions()
         target = self.state
-        state, reason = self._equilibrium(target)
+        state, reason = self._equilibrium(target, self._solution)
         if state is None:
             state = self._step_by_step(target, reason)
         self._solution = state
@@ -259,13 +272,17 @@ class Model(Scene):
             If the iteration for the eigenvalues does not find them.
         """
         self.read_functions()
-        shell_modes = ShellModes(self.model).vibrations(
-            self.state, count, allows_rigid_motion=self.allows_rigid_motion
+        space = mode_space(self.model)  # of a sector another model
+        shell_modes = ShellModes(space.model).vibrations(
+            space.state(self.state), count, allows_rigid_motion=self.allows_rigid_motion
         )
-        return [
-            Mode(mode.eigenvalue, mode.label, None if mode.label else self.function(mode.vector))
-            for mode in shell_modes
-        ]
+
+        def function_of(mode: ShellMode) -> fem.Function | None:
+            """Return a mode as a function; None if this model does not have it."""
+            is_own = space.model is self.model and not mode.label
+            return self.function(mode.vector) if is_own else None
+
+        return [Mode(mode.eigenvalue, mode.label, function_of(mode)) for mode in shell_modes]
 
     def function(self, vector: PETSc.Vec | Vector) -> fem.Function:
         """Return a vector of the model's unknowns as a function, such as an eigenvector."""
@@ -276,17 +293,29 @@ class Model(Scene):
         """Return values of this rank's unknowns as a PETSc vector."""
         return PETSc.Vec().createWithArray(values.copy(), comm=self.comm)
 
-    def _equilibrium(self, guess: State) -> tuple[State | None, str]:
-        """Return the equilibrium near a state at its amplitudes, or None and the reason."""
+    def _equilibrium(self, guess: State, before: State) -> tuple[State | None, str]:
+        """Return the equilibrium near a state at its amplitudes, or None and the reason.
+
+        Parameters
+        ----------
+        before
+            The equilibrium before, whose history it continues.
+        """
         if not guess.mu:
             raise Stopped("solve: the model has no load")
         name = next(iter(guess.mu))  # any of them, since it does not change
-        outcome = self.newton.solve(guess, name, PrescribedLoad(name, guess.mu[name]))
-        if not outcome.converged:
-            return None, outcome.reason
         system = self.model.system
-        state = system.advance(outcome.state, self._solution.mu)
-        return system.with_moved_supports(state), ""
+        for _ in range(MAX_CONTACT_SOLVES):
+            outcome = self.newton.solve(guess, name, PrescribedLoad(name, guess.mu[name]))
+            if not outcome.converged:
+                return None, outcome.reason
+            # stiffnesses and cuts of shells that touch change until they are fit
+            state_with_own_contact = with_own_contact(self, outcome.state)
+            if state_with_own_contact is None:
+                state = system.advance(outcome.state, before.mu)
+                return system.with_moved_supports(state), ""
+            guess = state_with_own_contact
+        return None, "the stiffness of shells that touch does not become fit"
 
     def _step_by_step(self, target: State, reason: str) -> State:
         """Return the equilibrium at the amplitudes of a state, from the last solution on.
@@ -297,18 +326,21 @@ class Model(Scene):
             Why Newton's method has failed at the target.
         """
         start = state = self._solution
+        loads = self.unloaded().mu.keys()  # without the history that a state has as well
         reached, step = 0.0, 0.5
         while reached < 1.0:
             fraction = min(reached + step, 1.0)
-            mu = {
-                name: start.mu.get(name, 0.0) + fraction * (value - start.mu.get(name, 0.0))
-                for name, value in target.mu.items()
+            amplitudes = {
+                name: start.mu[name] + fraction * (target.mu[name] - start.mu[name])
+                for name in loads
             }
-            next_state, reason_of_step = self._equilibrium(State(state.u, mu))
+            next_state, reason_of_step = self._equilibrium(
+                State(state.u, state.mu | amplitudes), before=state
+            )
             if next_state is not None:
                 state, reached, step = next_state, fraction, 2 * step
                 continue
-            reason, step = reason_of_step, step / 2
+            reason, step = reason_of_step, (fraction - reached) / 2
             if step < SMALLEST_LOAD_STEP:
                 raise Stopped(
                     f"solve: no equilibrium beyond {reached:.4g} of the way from the last "

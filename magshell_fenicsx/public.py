@@ -136,7 +136,8 @@ def sweep(
         over,
         settings,
         out,
-        say=say,
+        MPI.COMM_SELF if executor else MPI.COMM_WORLD,
+        say,
         make_case=Case.from_source,
         result=result,
         full_paths=full_paths,
@@ -180,6 +181,7 @@ def ensemble(
         make_case=Case.from_source,
         result=result,
         out=out,
+        comm=MPI.COMM_SELF if executor else MPI.COMM_WORLD,
         say=say,
         executor=executor,
     )

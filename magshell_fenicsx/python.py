@@ -196,7 +196,8 @@ class Shell:
         if isinstance(value, fem.Function | fem.Constant):
             return self.user_field(value, key)
         if callable(value) or isinstance(value, ufl.core.expr.Expr):
-            kind = "a function of Python" if callable(value) else "an expression"
+            is_expression = isinstance(value, ufl.core.expr.Expr)  # which can be called, too
+            kind = "an expression of UFL" if is_expression else "a function of Python"
             raise CaseError(
                 f"{NAME}: {key}: is {kind}"
                 ': give a formula such as "1 + 0.2*x", or a dolfinx function: '
@@ -244,10 +245,10 @@ class ProblemPart:
     """
 
     def __init__(self, key: str, keys: Callable[[Shell], Keys], text: str) -> None:
-        self.key, self.keys, self._text = key, keys, text
+        self.key, self.keys, self.text = key, keys, text
 
     def __repr__(self) -> str:
-        return self._text
+        return self.text
 
 
 class Section(ProblemPart):
@@ -324,6 +325,7 @@ class Pressure(Step):
 
     def __init__(self, **keys: Unpack[PressureKeys]) -> None:
         super().__init__("pressure", **keys)
+        self.text = _call_text("Pressure", (), keys)
 
 
 class Force(Step):
@@ -339,6 +341,7 @@ class Force(Step):
 
     def __init__(self, at: Mapping[str, Any] | str, **keys: Unpack[ForceKeys]) -> None:
         super().__init__("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
+        self.text = _call_text("Force", (at,), keys)
         if not keys.keys() & {"depth", "force", "until"}:
             raise CaseError(
                 f'{NAME}: Force: {at}: where does it end? give depth, such as "2 mm", or force, or '
@@ -440,7 +443,8 @@ class Field(ProblemPart):
                 section["lambda_m"] = shell.plain_value(lambda_m, "magnetic.lambda_m")
             return section
 
-        super().__init__("magnetic", magnetic_keys, _call_text("Field", (remanent, applied), keys))
+        given = dict(keys) if lambda_m is None else {"lambda_m": lambda_m, **keys}
+        super().__init__("magnetic", magnetic_keys, _call_text("Field", (remanent, applied), given))
 
 
 def _refuse_mesh_keys(geometry: str, **mesh_keys: Any) -> None:

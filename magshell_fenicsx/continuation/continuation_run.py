@@ -873,7 +873,7 @@ class ContinuationRun:
         if not refusal:
             return point, events, None, ""
         apart = self._budget.apart
-        if apart and apart.point.s != low.s:
+        if apart and (apart.point.s - low.s) * (point.s - low.s) > 0:
             end = self.path.as_base(apart.point)
             events, refusal_before = self._accepted_events(low, end)
             if not (refusal_before or self._renewed_step(low, end)):

@@ -248,6 +248,7 @@ class UserMesh:
             Those of `displacement`.
         """
         V, W = into.function_space, u.function_space
+        u.x.scatter_forward()  # a program may have set its own values alone
         nodal_of_own = u.x.array.reshape(-1, 3)[W.dofmap.list[: self._owned]]
         nodal_of_all = self._gather_cells(nodal_of_own) * scale
         number, is_reversed = source_triangles.T

@@ -175,6 +175,11 @@ def _needs_inertia_alone(step: ProgrammeStep) -> bool:
     return isinstance(step.load, TimeSection) and step.load.needs_inertia_alone
 
 
+def _made_by(maker: "Callable[[], Problem]") -> "Problem":
+    """Return the problem that a function makes, which can be pickled again."""
+    return maker().made_by(maker)
+
+
 @dataclass(frozen=True, repr=False)
 class Problem:
     """Everything that will be computed, dimensionless (lengths in R).
@@ -283,14 +288,14 @@ class Problem:
         object.__setattr__(self, "maker", maker)
         return self
 
-    def __reduce__(self) -> "tuple[Callable[[], Problem], tuple[()]]":
+    def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes the problem again where it is unpickled."""
         if self.maker is None:
             raise TypeError(
                 "a problem that was changed since its case made it cannot be pickled: pickle that "
                 "of ms.Problem, or the case"
             )
-        return self.maker, ()
+        return _made_by, (self.maker,)
 
     def __repr__(self) -> str:
         """Return the problem in a few lines."""

@@ -221,6 +221,7 @@ class ShellModel(ThinModel):
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.load_size, self.load_sizes = {}, {}
         self.kernels = KernelLog()
+        self._has_old_fields = False
         # of the functions of a program: field, its values in the model, and what reads them anew
         self._user_values: list[tuple[UserField, Array, Callable[[], Array]]] = []
         self.V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
@@ -343,10 +344,13 @@ class ShellModel(ThinModel):
     def _function_of_term(self, user_field: UserField) -> fem.Function:
         """Return a user's field as a function, with values that `read_functions` sets."""
         function = self.midsurface.function(user_field)
+        dofs = function.function_space.dofmap.list
 
         def read() -> Array:
             """Return the values of the function anew."""
-            return np.asarray(self.midsurface.function(user_field).x.array)
+            values = np.empty_like(function.x.array)
+            values.reshape(-1, user_field.size)[dofs] = self.midsurface.in_cells(user_field)
+            return values
 
         self._user_values.append((user_field, function.x.array, read))
         return function
@@ -365,7 +369,7 @@ class ShellModel(ThinModel):
         MeshError
             On every rank, if values are not allowed.
         """
-        has_changed = False
+        has_changed = self._has_old_fields
         for user_field, values, read in self._user_values:
             user_field.update()
             new_values = read()
@@ -373,9 +377,11 @@ class ShellModel(ThinModel):
             values[...] = new_values
         if not self.midsurface.mesh.comm.allreduce(has_changed, MPI.LOR):
             return False
+        self._has_old_fields = True  # until all are made: a value may be refused
         forms = [term for term in self.system.terms if isinstance(term, FormTerm)]
         for field in fields_of_placement(forms):
             field.x.array[:] = field.rebuild(self.r0).x.array
+        self._has_old_fields = False
         return True
 
     def _put_edges_in_planes(self) -> None:

@@ -6,7 +6,6 @@ an interrupted study goes on. A task is a point, or several that belong together
 line.
 """
 
-import itertools
 import os
 import sys
 import threading
@@ -32,9 +31,8 @@ Say = Callable[[str], None]
 Task = TypeVar("Task")
 LEAST_LEFT = 10.0  # s; a shorter rest is not said
 SECONDS_BETWEEN_LINES = terminal.STATUS_SECONDS  # s
-# tasks go to an executor in so many batches: a process begins a batch with what the one before it
-# has found, and a batch is what is lost if it ends
-MAX_BATCHES = 16
+# tasks that an executor gets together: within them a process goes on from what it has found
+TASKS_OF_BATCH = 4
 
 
 def _are_of_part(first: str, number: str, count: int) -> bool:
@@ -111,9 +109,10 @@ def compute(
     # `progress` says lines, and after a long silence that the work goes on
     with _wait_for_all(comm), reporting_progress(comm, say, remaining_text) as progress:
         if executor:
-            for line in _lines_of_executor(tasks, do, comm, executor):
-                done_count += 1
-                progress(line + remaining_text())
+            for lines, count in _results_of_executor(tasks, do, comm, executor):
+                done_count += count
+                for line in lines:
+                    progress(line + remaining_text())
             return
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
@@ -121,24 +120,22 @@ def compute(
                 progress(line + remaining_text())
 
 
-def _lines_of_executor(
+def _results_of_executor(
     tasks: Sequence[Task],
     do: Callable[[Task], Iterable[str]],
     comm: MPI.Intracomm,
     executor: Executor,
-) -> Iterator[str]:
-    """Compute tasks in the processes of an executor; yield the lines of text as they come."""
+) -> Iterator[tuple[list[str], int]]:
+    """Compute tasks in the processes of an executor; yield lines of text, of how many tasks."""
     if comm.size > 1:
         raise CaseError("jobs: take either ranks of mpirun or the processes of an executor")
-    batch_count = min(MAX_BATCHES, len(tasks))
-    bounds = [i * len(tasks) // max(batch_count, 1) for i in range(batch_count + 1)]
-    batches = [tasks[begin:end] for begin, end in itertools.pairwise(bounds)]
-    futures = [executor.submit(_lines_of_batch, batch, do) for batch in batches]
+    batches = [tasks[i : i + TASKS_OF_BATCH] for i in range(0, len(tasks), TASKS_OF_BATCH)]
+    sizes = {executor.submit(_lines_of_batch, batch, do): len(batch) for batch in batches}
     try:
-        for future in as_completed(futures):
-            yield from future.result()
+        for future in as_completed(sizes):
+            yield future.result(), sizes[future]
     finally:  # those that have not begun, after an error or an interrupt
-        for future in futures:
+        for future in sizes:
             future.cancel()
 
 

@@ -32,7 +32,7 @@ def test_a_problem_in_another_process() -> None:
 def test_a_problem_of_python() -> None:
     shell = ms.Shell("hemisphere", radius_to_thickness=90, poisson_ratio=0.5)
     problem = ms.Problem(shell, ms.Clamped("equator"), ms.Pressure(until="limit"))
-    copy = pickle.loads(pickle.dumps(problem))
+    copy = pickle.loads(pickle.dumps(pickle.loads(pickle.dumps(problem))))
     assert copy.document.data == problem.document.data
     assert repr(copy) == repr(problem)
 
