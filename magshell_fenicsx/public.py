@@ -326,6 +326,7 @@ def run(  # noqa: PLR0913 - what a user gives
     if out is None:  # with a folder they are there already
         on_first: Say = say if comm.rank == 0 else lambda line: None
         frequencies_after(result, None, on_first)
+        result.fine_scenes.clear()
         if problem.gradients is not None:
             from magshell_fenicsx.runs.gradients import gradients_after
 

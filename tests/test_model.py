@@ -4,13 +4,17 @@ PETSc's SNES and SLEPc's eigensolvers, as a program sets them up, find the equil
 that the package finds by its own ways.
 """
 
+import subprocess
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import basix.ufl
 import numpy as np
 import pytest
 import ufl
+from command import importing_environment, mpirun
 from conftest import CASES
 from dolfinx import fem, mesh
 from mpi4py import MPI
@@ -23,18 +27,19 @@ import magshell_fenicsx as ms
 LENGTH, WIDTH, HEIGHT = 40.0, 15.0, 4.0
 
 
-def strip() -> tuple[mesh.Mesh, dict[str, Any]]:
-    """A curved strip of quadratic triangles in mm, and the arguments of its `ms.Shell`."""
+def strip(comm: MPI.Intracomm = MPI.COMM_SELF) -> tuple[mesh.Mesh, dict[str, Any]]:
+    """A curved strip of triangles in mm, and the arguments of its `ms.Shell`."""
     flat = mesh.create_rectangle(
         MPI.COMM_SELF, [(0.0, 0.0), (LENGTH, WIDTH)], (4, 2), mesh.CellType.triangle
     )
     nodes = flat.geometry.x
     nodes[:, 2] = HEIGHT * np.sin(np.pi * nodes[:, 0] / (2 * LENGTH))
-    cells = flat.geometry.dofmap
+    cells = flat.geometry.dofmap.astype(np.int64)
+    is_first = comm.rank == 0  # which gives all cells
     surface = mesh.create_mesh(
-        MPI.COMM_SELF,
-        cells.astype(np.int64),
-        nodes,
+        comm,
+        cells if is_first else cells[:0],
+        nodes if is_first else nodes[:0],
         basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)),
     )
     surface.topology.create_connectivity(1, 2)
@@ -51,16 +56,16 @@ def strip() -> tuple[mesh.Mesh, dict[str, Any]]:
     }
 
 
-def model_of_strip() -> ms.Model:
+def model_of_strip(comm: MPI.Intracomm = MPI.COMM_SELF) -> ms.Model:
     """A strip under its weight."""
-    surface, arguments = strip()
+    surface, arguments = strip(comm)
     problem = ms.Problem(
         ms.Shell(surface, **arguments),
         ms.Clamped("root"),
         ms.Step("dead", loads=[{"over": "all", "per_area": ["0 Pa", "0 Pa", "-1 Pa"]}], factor=1),
         degree=3,
     )
-    return ms.Model(problem, MPI.COMM_SELF)
+    return ms.Model(problem)
 
 
 def model_of_case(file: str, settings: Sequence[str]) -> ms.Model:
@@ -70,7 +75,7 @@ def model_of_case(file: str, settings: Sequence[str]) -> ms.Model:
 
 COARSE = "mesh.refinement=0.5"
 MODELS = {
-    "surface": (lambda: model_of_strip(), {"load": 2.0}),
+    "surface": (model_of_strip, {"load": 2.0}),
     "meridian": (lambda: model_of_case("dimple_buckling.yaml", [COARSE]), {"pressure": 0.2}),
     "rubber": (lambda: model_of_case("balloon.yaml", [COARSE]), {"pressure": -1.0}),
     "contact": (lambda: model_of_case("plate_contact.yaml", [COARSE]), {"approach": 0.5}),
@@ -249,3 +254,56 @@ def test_far_loads_are_reached_step_by_step() -> None:
     record = model.solve()
     assert record.point.negative_pivots == 0
     assert np.abs(model.residual().array).max() < 1e-9
+
+
+def test_supports_stay_where_they_are() -> None:
+    """A displacement that a program sets at held unknowns is not taken."""
+    model = model_of_strip()
+    model.set(load=1.0)
+    model.solve()
+    u = model.unknowns()
+    model.u.x.array[:] += 0.1
+    assert np.abs(model.state.u[model.held]).max() == 0.0
+    u.array[model.held] = 1.0
+    model.put(u)
+    assert np.abs(model.state.u[model.held]).max() == 0.0
+
+
+def test_modes_of_a_sector_are_those_of_the_shell() -> None:
+    """A sector leaves out modes that its half has."""
+    whole, sector = (
+        model_of_case("dimple_buckling.yaml", ["mesh.refinement=0.3", f"symmetry={symmetry}"])
+        for symmetry in ("half", "4")
+    )
+    lowest = [model.modes(1)[0].omega2 for model in (whole, sector)]
+    assert lowest[1] == pytest.approx(lowest[0], rel=1e-2)
+
+
+def test_state_on_two_ranks(tmp_path: Path) -> None:
+    """A program on two ranks that sets its own values alone gets the state of these values."""
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    command = [*mpirun(2), sys.executable, str(program)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=importing_environment()
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.split()[-1]) < 1e-12
+
+
+PROGRAM = """
+import numpy as np
+from mpi4py import MPI
+import test_model
+import magshell_fenicsx as ms
+
+model = test_model.model_of_strip(MPI.COMM_WORLD)
+model.set(load=1.0)
+model.solve()
+state, u = model.state, model.u
+own = u.function_space.dofmap.index_map.size_local * 3
+u.x.array[:own] *= 0.5
+difference = MPI.COMM_WORLD.allreduce(np.abs(model.state.u - 0.5 * state.u).max(), MPI.MAX)
+if MPI.COMM_WORLD.rank == 0:
+    print(difference / np.abs(state.u).max())
+"""

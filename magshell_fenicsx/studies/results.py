@@ -92,10 +92,15 @@ class Scalar:
         """
         if not self.column:
             return _number(errors.get(self.name))
-        path = [row for row in rows if row["branch"] == "0"]
+        path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         is_at_end = self.at == "end"
         if path and self.at in path[-1]:
-            is_at_end = math.isclose(float(path[-1][self.at]), self.value, rel_tol=1e-9)
+            *earlier_places, last_place = (float(row[self.at]) for row in path)
+            is_passed_before = any(
+                (a - self.value) * (b - self.value) <= 0 for a, b in pairwise(earlier_places)
+            )
+            is_last = math.isclose(last_place, self.value, rel_tol=1e-9)
+            is_at_end = is_last and not is_passed_before
         return _number(errors.get(f"{self.column}@end")) if is_at_end else None
 
 
