@@ -227,7 +227,8 @@ def line(row: Row) -> str:
     estimate = estimates.errors.get(row.result, nan)
     effectivity = f"{estimate / true_error:.2f}"
     if not isfinite(estimate):
-        effectivity = f"not estimated: {next(iter(estimates.reasons.values()))}"
+        reason = estimates.reasons.get(row.result) or next(iter(estimates.reasons.values()))
+        effectivity = f"none: {reason}"
     elif true_error < max(map(load_error, (coarse_run, fine_run))):
         effectivity = "below the error of the solver"
     has_warning = row.result in coarse_run.large_errors or bool(estimates.too_coarse)
@@ -245,7 +246,15 @@ def line(row: Row) -> str:
 
 def main(names: list[str]) -> None:
     """Print the table, of some cases or kinds of results, or of all."""
-    heads = "case", "result", "mesh", "value", "relative error", "effectivity", "warning"
+    heads = (
+        "case",
+        "result",
+        "degree, refinement",
+        "value",
+        "relative error",
+        "effectivity",
+        "warning",
+    )
     print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}", flush=True)
     for row in ROWS:
         if not names or {row.case, row.what} & set(names):

@@ -279,6 +279,7 @@ def test_modes_of_a_sector_are_those_of_the_shell() -> None:
     assert lowest[1] == pytest.approx(lowest[0], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_state_on_two_ranks(tmp_path: Path) -> None:
     """A program on two ranks that sets its own values alone gets the state of these values."""
     program = tmp_path / "program.py"

@@ -761,8 +761,8 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     """Return a remark on instabilities too close to each other to be located one by one.
 
     It stands at the first point of each such cluster of a run; at other points it is "". Where the
-    number of unstable directions changes by less than two over the cluster, one is a fold; or there
-    is one alone, between two branches that pass near each other.
+    number of unstable directions changes by one, there is one alone, between two branches that pass
+    near each other; where it does not change, one of two is a fold.
     """
     # a cluster has a first and a last point
     other_end = next(
@@ -779,7 +779,7 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
             f"instabilities in {count} directions between {first_amount} and {last_amount} are "
             "too close to be located one by one"
         )
-    if count and point.dmu * other_end.dmu > 0:  # the amplitude does not turn back
+    if count:
         return (
             f"an instability between {first_amount} and {last_amount} cannot be located more "
             "closely: an imperfection parts the branches there, and they pass too near each other"
