@@ -126,7 +126,7 @@ def test_a_live_pressure_beside_a_free_edge_takes_more(
         "boundary: {bottom: clamped}\n"
         "symmetry: none\n"
         "loading: {kind: pressure, until: target, control: load, pressure: 1e-8, points: 1}\n"
-        "mesh: {degree: 2, refinement: 0.7}\n"
+        "mesh: {degree: 2, refinement: 0.85}\n"
     )
     monkeypatch.setenv("MAGSHELL_MEMORY", "0.3")
     closed = magshell("check", case, "--set", "boundary.top=clamped")

@@ -161,7 +161,8 @@ def test_a_free_disc_as_a_meridian() -> None:
     """Along and around its axis it moves freely, and across it; then it vibrates with n = 2, 0 and
     3.
     """
-    shell = {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.33}
+    # rounding is less than 1e-5 at this thickness
+    shell = {"geometry": "disc", "radius_to_thickness": 300, "poisson_ratio": 0.33}
     scene = scene_of(shell, {"rim": "free"}, frequencies={})
     modes = ShellModes(scene.model).vibrations(
         scene.unloaded(), 7, allows_rigid_motion=scene.allows_rigid_motion

@@ -83,7 +83,7 @@ def analytic(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """
     done: list[int] = []
 
-    def solve(sample: Sample, scalar: Any, known: KnownFolds) -> Outcome:
+    def solve(sample: Sample, scalar: Any, folds: KnownFolds) -> Outcome:
         done.append(sample.number)
         if sample.number == 7:
             raise KeyboardInterrupt

@@ -48,9 +48,10 @@ def errors_at_points(rows: Sequence[Row], errors: Mapping[str, float]) -> PointE
     located = [row for row in path if row["label"] in LOCATED]
     for number, row in enumerate(located, 1):
         error = errors.get("limit_load" if number == 1 else f"limit_load_{number}")
+        if error is None:
+            continue
         column = registered(str(row["amplitude"])).column
-        value = float(row[column])
-        if error is None or not value:
+        if not (value := float(row[column])):
             continue
         # the axis may have the load in a unit
         shown = shown_quantity(column, row).name
