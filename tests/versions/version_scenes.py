@@ -51,7 +51,8 @@ def _scene(file: str, *settings: str, on_file: bool = False) -> Scene:
     if not on_file:
         return Scene(case)
     problem = make_problem(case)
-    return Scene(ProblemOnFile(**{f.name: getattr(problem, f.name) for f in fields(Problem)}))
+    values = {f.name: getattr(problem, f.name) for f in fields(Problem) if f.init}
+    return Scene(ProblemOnFile(**values))
 
 
 def _end(scene: Scene) -> Record:
