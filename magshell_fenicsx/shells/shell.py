@@ -350,7 +350,7 @@ class ShellModel(ThinModel):
             """Return the values of the function anew."""
             values = np.empty_like(function.x.array)
             values.reshape(-1, user_field.size)[dofs] = self.midsurface.in_cells(user_field)
-            return values
+            return np.asarray(values)
 
         self._user_values.append((user_field, function.x.array, read))
         return function
