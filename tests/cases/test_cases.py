@@ -144,7 +144,7 @@ def test_dimple_drift_on_the_shell() -> None:
     lowers and raises the pressures by up to 3e-3.
     """
     records = list(follow(scene := Scene(Case.load(CASES / "dimple_drift.yaml"))))
-    shell = Scene(Case.load(CASES / "dimple_drift.yaml", ["symmetry=half", "mesh.refinement=1.5"]))
+    shell = Scene(Case.load(CASES / "dimple_drift.yaml", ["symmetry=half", "mesh.refinement=1.8"]))
     assert isinstance(scene.model, MeridianModel)
     assert shell.model.symmetry_breaking_modes
     x, y, z = shell.model.r0.x.array.reshape(-1, 3).T
