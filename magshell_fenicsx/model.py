@@ -141,7 +141,7 @@ class Model(Scene):
         return dict(self._state.mu)
 
     @property
-    def held(self) -> NDArray[np.int32]:
+    def held_unknowns(self) -> NDArray[np.int32]:
         """Numbers of this rank's unknowns that supports hold or move.
 
         Supports in an oblique direction hold sums of unknowns, which are not among them.
@@ -293,12 +293,12 @@ class Model(Scene):
         """Return values of this rank's unknowns as a PETSc vector."""
         return PETSc.Vec().createWithArray(values.copy(), comm=self.comm)
 
-    def _equilibrium(self, guess: State, before: State) -> tuple[State | None, str]:
+    def _equilibrium(self, guess: State, previous_state: State) -> tuple[State | None, str]:
         """Return the equilibrium near a state at its amplitudes, or None and the reason.
 
         Parameters
         ----------
-        before
+        previous_state
             The equilibrium before, whose history it continues.
         """
         if not guess.mu:
@@ -312,7 +312,7 @@ class Model(Scene):
             # stiffnesses and cuts of shells that touch change until they are fit
             state_with_own_contact = with_own_contact(self, outcome.state)
             if state_with_own_contact is None:
-                state = system.advance(outcome.state, before.mu)
+                state = system.advance(outcome.state, previous_state.mu)
                 return system.with_moved_supports(state), ""
             guess = state_with_own_contact
         return None, "the stiffness of shells that touch does not become fit"
@@ -327,23 +327,23 @@ class Model(Scene):
         """
         start = state = self._solution
         loads = self.unloaded().mu.keys()  # without the history that a state has as well
-        reached, step = 0.0, 0.5
-        while reached < 1.0:
-            fraction = min(reached + step, 1.0)
+        solved_fraction, step = 0.0, 0.5
+        while solved_fraction < 1.0:
+            fraction = min(solved_fraction + step, 1.0)
             amplitudes = {
                 name: start.mu[name] + fraction * (target.mu[name] - start.mu[name])
                 for name in loads
             }
             next_state, reason_of_step = self._equilibrium(
-                State(state.u, state.mu | amplitudes), before=state
+                State(state.u, state.mu | amplitudes), previous_state=state
             )
             if next_state is not None:
-                state, reached, step = next_state, fraction, 2 * step
+                state, solved_fraction, step = next_state, fraction, 2 * step
                 continue
-            reason, step = reason_of_step, (fraction - reached) / 2
+            reason, step = reason_of_step, (fraction - solved_fraction) / 2
             if step < SMALLEST_LOAD_STEP:
                 raise Stopped(
-                    f"solve: no equilibrium beyond {reached:.4g} of the way from the last "
+                    f"solve: no equilibrium beyond {solved_fraction:.4g} of the way from the last "
                     f"solution to the loads that are set: {reason}"
                 )
         return state

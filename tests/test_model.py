@@ -151,7 +151,7 @@ def test_tangent_is_the_derivative_of_the_residual(solved: ms.Model) -> None:
     """By central differences, along a displacement that supports allow."""
     model, state = solved, solved.state
     direction = np.random.default_rng(0).normal(size=state.u.shape) * 1e-6 * np.abs(state.u).max()
-    direction[model.held] = 0.0
+    direction[model.held_unknowns] = 0.0
     product, residuals = model.unknowns(), []
     vector = model.unknowns()
     vector.array[:] = direction
@@ -263,10 +263,10 @@ def test_supports_stay_where_they_are() -> None:
     model.solve()
     u = model.unknowns()
     model.u.x.array[:] += 0.1
-    assert np.abs(model.state.u[model.held]).max() == 0.0
-    u.array[model.held] = 1.0
+    assert np.abs(model.state.u[model.held_unknowns]).max() == 0.0
+    u.array[model.held_unknowns] = 1.0
     model.put(u)
-    assert np.abs(model.state.u[model.held]).max() == 0.0
+    assert np.abs(model.state.u[model.held_unknowns]).max() == 0.0
 
 
 def test_modes_of_a_sector_are_those_of_the_shell() -> None:

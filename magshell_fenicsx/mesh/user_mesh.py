@@ -77,6 +77,7 @@ class UserMesh:
         self._spaces: dict[int, fem.FunctionSpace] = {}
 
     def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled."""
         raise TypeError(
             "a dolfinx mesh belongs to its process and cannot be pickled: make the problem in each "
             "process, or write the mesh to a file that a case names"
@@ -232,7 +233,7 @@ class UserMesh:
         return displacement
 
     def put_displacement(
-        self, u: fem.Function, into: fem.Function, source_triangles: Numbers, scale: float
+        self, u: fem.Function, target: fem.Function, source_triangles: Numbers, scale: float
     ) -> None:
         """Put a function on this mesh into a field of a scene, as `displacement` reversed.
 
@@ -242,20 +243,18 @@ class UserMesh:
         ----------
         u
             A vector Lagrange function on this mesh, of the degree of the scene's field.
-        into
+        target
             The vector Lagrange function on the scene's mesh.
         source_triangles, scale
             Those of `displacement`.
         """
-        V, W = into.function_space, u.function_space
+        V, W = target.function_space, u.function_space
         u.x.scatter_forward()  # a program may have set its own values alone
         nodal_of_own = u.x.array.reshape(-1, 3)[W.dofmap.list[: self._owned]]
         nodal_of_all = self._gather_cells(nodal_of_own) * scale
-        number, is_reversed = source_triangles.T
-        nodal = nodal_of_all[number]
-        swapped = nodal[:, swapped_nodes(V.element.basix_element)]
-        nodal = np.where(is_reversed[:, None, None] == 1, swapped, nodal)
-        into.x.array.reshape(-1, 3)[V.dofmap.list] = nodal
+        element = V.element.basix_element
+        field = UserField("u", element.degree, nodal_of_all, swapped_nodes(element))
+        target.x.array.reshape(-1, 3)[V.dofmap.list] = field.in_cells(source_triangles)
 
     def _original_numbers(self, cell_map: Any) -> Numbers:
         """Return the number of each local cell, ghosts included, in the order of their making.

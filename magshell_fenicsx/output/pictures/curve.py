@@ -92,9 +92,10 @@ def curve_figure(
             axes.set_title(step.title)
         legend(figure, max_columns=4 * min(len(steps), 2))
         figure.draw_without_rendering()  # insets need the places of the axes
+        errors_of_points = errors_at_points(rows, errors or {})
         for axes, step in zip(list(figure.axes), steps, strict=True):
             draw_hidden(axes, step)
-            draw_error_band(axes, step, errors_at_points(rows, errors or {}))
+            draw_error_band(axes, step, errors_of_points)
     return figure
 
 
