@@ -37,7 +37,33 @@ OVER = {  # cases of magshell boundary -> the keys that vary
     "cap_boundary": ["shell.polar=15:28"],
     "snap_map": ["shell.defect.amplitude=0.4:2:4", "magnetic.lambda_m=-0.004:0.004:5"],
 }
-THUMB = 110  # pixels of a picture in the table at the head
+THUMB, COLUMNS = 110, 6  # pixels of a picture in the tables at the head, and pictures in a row
+GROUPS = {  # question -> its cases
+    "At which load does it buckle?": (
+        "dimple_buckling two_dimples cylinder_waves cap_waves_branch dome_on_wall cap_boundary "
+        "random_dimples dimple_drift snap_back"
+    ),
+    "When does it snap, and back?": (
+        "bistable_dome arch arch_boundary arch_snap snap_map snapped probing laminated_roof crease "
+        "magnet_past_strip magnet_stack strip_buckling soft_strip"
+    ),
+    "Which force dents it, and what does it press on?": (
+        "indentation indentation_snap_back pole_indentation plate_contact ball_contact egg_contact "
+        "rod_contact collapsing_tube coaxial_domes stacked_domes dome_lands two_balloons"
+    ),
+    "How far does it bend?": (
+        "gripper gripper_closed magnetic_strip magnet_strip saturated_strip own_field "
+        "magnetic_balloon balloon natural_strip standing_strip shortened_strip programme bracket "
+        "stiffened_plate clamped_plate foundation"
+    ),
+    "What does a sensor read, how does it ring?": "hall_sensor free_plate spinning_blade",
+    "How do I shape or magnetise it, what is my sample?": (
+        "designed_letter designed_strip designed_gripper designed_hemisphere designed_neighbour "
+        "designed_field designed_thickness designed_shape where_to_magnetise identify_arch "
+        "identify_field"
+    ),
+    "Is a shell good enough?": "solid_buckling solid_indentation",
+}
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. \
@@ -91,9 +117,32 @@ def row(file: Path) -> str:
 
 
 def thumbnails(names: Sequence[str]) -> str:
-    """All pictures in small, each a link to its part of the page."""
-    one = '[<img src="{0}.png" width="{1}" alt="{0}" title="{0}">](#{0})'
-    return "\n".join(one.format(name, THUMB) for name in names) + "\n"
+    """Return the pictures in small, each a link to its part of the page, by question."""
+    groups = {question: cases.split() for question, cases in GROUPS.items()}
+    grouped = {name for cases in groups.values() for name in cases}
+    groups["Others"] = [name for name in names if name not in grouped]
+    tables = []
+    for question, cases in groups.items():
+        shown = [name for name in cases if name in names]
+        if shown:
+            rows = [shown[i : i + COLUMNS] for i in range(0, len(shown), COLUMNS)]
+            tables.append(f"**{question}**\n\n" + "\n".join(_rows_of_table(rows)) + "\n")
+    return "\n".join(tables)
+
+
+def _rows_of_table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table with pictures, each row above its names."""
+    picture = '[<img src="{0}.png" width="{1}" alt="{0}" title="{0}">](#{0})'
+    lines = []
+    for i, names in enumerate(rows):
+        blanks = [""] * (len(rows[0]) - len(names))
+        pictures = [picture.format(name, THUMB) for name in names]
+        lines.append("| " + " | ".join([*pictures, *blanks]) + " |")
+        if i == 0:
+            lines.append("| " + " | ".join([":-:"] * len(names)) + " |")
+        captions = [f"[{name}](#{name})" for name in names]
+        lines.append("| " + " | ".join([*captions, *blanks]) + " |")
+    return lines
 
 
 def telling(folder: Path) -> list[str]:
@@ -111,7 +160,7 @@ def telling(folder: Path) -> list[str]:
             return [name]
     if rows[-1]["amplitude"] == "time":
         return ["curve.png"]
-    steps = case_in(folder)["loading"]
+    steps = case_in(folder).get("loading", [])
     if any(
         step.get("then") == "follow" for step in (steps if isinstance(steps, list) else [steps])
     ):

@@ -338,6 +338,22 @@ def null_vector(K: Tangent) -> Vector:
         raise ModesNotFound(str(e)) from None
 
 
+def lowest_mode(K: Tangent) -> Vector:
+    """Return the eigenvector of a tangent's lowest eigenvalue. Collective.
+
+    If the tangent is skewed, it is that of its symmetric part.
+
+    Raises
+    ------
+    ModesNotFound
+        If the iteration does not find it.
+    """
+    symmetric = symmetric_part(K)
+    identity = symmetric.duplicate()
+    identity.shift(1.0)
+    return lowest_modes(symmetric, identity, 1)[0].vector
+
+
 class _SpectrumSlices:
     """The inertia of K - sigma M for several sigma, and the eigenpairs nearest to sigma.
 

@@ -41,8 +41,10 @@ from magshell_fenicsx.continuation.fold import (
 )
 from magshell_fenicsx.continuation.modes import (
     critical_mode,
+    lowest_mode,
     nearest_to_zero,
 )
+from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.stability_monitor import ModeFamily
 from magshell_fenicsx.continuation.system import State, System, Vector, dot, symmetric_part
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
@@ -501,7 +503,8 @@ class DegreeComparison:
 
         A force along the mode b holds the displacement along b near the point, so that the tangent
         stays regular. The mode is neutral where K v + g b = 0, b . v = 1 gives g = 0: one step of
-        Newton's method along the path goes there.
+        Newton's method along the path goes there. Where other modes are unstable with one degree
+        more, as the other one of a pair, the lowest mode is neutral first.
 
         Raises
         ------
@@ -512,13 +515,13 @@ class DegreeComparison:
             raise NotEstimated("a bifurcation at which the load changes along the branch")
         stage, guess = self._stage()
         newton, name = stage.newton, self.record.amplitude
-        b = critical_mode(newton, guess).vector
-        held_state = held_along(newton, guess, b)
-        if held_state is None:
-            raise TooCoarse(NO_EQUILIBRIUM)
-        state, _ = held_state
-        system, tangent = newton.system, AugmentedTangent(newton, state, b)
-        self._refuse_later(tangent.unstable, self.record.point.negative_pivots)
+        system, unstable_before = newton.system, self.record.point.negative_pivots
+        state, tangent = _held_along_mode(newton, guess, critical_mode(newton, guess).vector)
+        if self._others_are_first(tangent.unstable, unstable_before):
+            lowest = lowest_mode(system.tangent(state.u, state.mu))
+            state, tangent = _held_along_mode(newton, state, lowest)
+        else:
+            self._refuse_later(tangent.unstable, unstable_before)
         w_mu, _ = tangent.solve(system.load(state.u, state.mu, name))
         cubic = third_derivative(system, state, tangent.v)
         K_mu_v = first_difference(
@@ -567,9 +570,31 @@ class DegreeComparison:
         NotEstimated
             If there are more.
         """
-        is_other_first = not self.is_later and unstable_before <= 1 <= unstable
-        if unstable > unstable_before or is_other_first:
+        if unstable > unstable_before or self._others_are_first(unstable, unstable_before):
             raise TooCoarse(OTHERS_FIRST)
+
+    def _others_are_first(self, unstable: int, unstable_before: int) -> bool:
+        """Return whether other modes are unstable at a first instability, with one degree more.
+
+        Parameters are those of `_refuse_later`.
+        """
+        return not self.is_later and unstable_before <= 1 <= unstable
+
+
+def _held_along_mode(
+    newton: BorderedNewton, guess: State, b: Vector
+) -> tuple[State, AugmentedTangent]:
+    """Return the equilibrium with a force along a mode, and its tangent; collective.
+
+    Raises
+    ------
+    TooCoarse
+        If Newton's method finds none.
+    """
+    held_state = held_along(newton, guess, b)
+    if held_state is None:
+        raise TooCoarse(NO_EQUILIBRIUM)
+    return held_state[0], AugmentedTangent(newton, held_state[0], b)
 
 
 def _load_change(eigenvalue_change: float, slope: float, load: float) -> float:

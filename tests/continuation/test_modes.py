@@ -15,6 +15,7 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.modes import (
     ModesNotFound,
     NoEigenpair,
+    lowest_mode,
     lowest_modes,
     nearest_to_zero,
     null_vector,
@@ -160,6 +161,13 @@ def test_null_vector_of_a_nearly_singular_matrix() -> None:
     v, mode = null_vector(K), lowest_modes(K, M, 2)[1]
     assert np.linalg.norm(v) == pytest.approx(1.0)
     assert abs(v @ mode.vector) == pytest.approx(np.linalg.norm(mode.vector), rel=1e-6)
+
+
+def test_lowest_mode_of_an_indefinite_matrix() -> None:
+    """Not the one nearest to zero; by NumPy."""
+    A = symmetric([-3.0, -2.9, 1e-10, 2.0])
+    v, lowest = lowest_mode(matrix(A)), np.linalg.eigh(A)[1][:, 0]
+    assert abs(v @ lowest) == pytest.approx(np.linalg.norm(v), rel=1e-9)
 
 
 def test_spectrum_without_a_lower_end_is_refused() -> None:

@@ -79,6 +79,25 @@ def test_pitchfork_of_a_strip() -> None:
 
 
 @pytest.mark.slow
+def test_waves_in_a_pair() -> None:
+    """A whole tube that is shortened: both waves are unstable with one degree more.
+
+    The reference is that of the meridian, whose estimated error is 4e-8.
+    """
+    tube = {"geometry": "cylinder", "radius": 30, "length": 30, "thickness": 0.5}
+    move = {"supports": ["top"], "translation": [0, 0, -1]}
+    case = {
+        "shell": {**tube, "youngs_modulus": 1, "poisson_ratio": 0.29},
+        "boundary": {"bottom": "clamped", "top": "clamped"},
+        "mesh": {"degree": 4, "refinement": 0.6},
+        "symmetry": "none",
+        "loading": {"kind": "edge", "name": "shortening", "moves": [move], "until": "bifurcation"},
+    }
+    result = run(Case.from_source(case))
+    check_effectivity(result, "limit_load", float(result.limit_points[0]["value"]), 0.27929334)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "refinement"), [(3, 0.4), (4, 0.6)])
 def test_mode_that_a_half_excludes(degree: int, refinement: float) -> None:
     """Antisymmetric; degree 5, refinement 0.9. The first mesh is 32 % off: it says so."""

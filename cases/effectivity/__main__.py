@@ -16,7 +16,7 @@ from mpi4py import MPI
 from magshell_fenicsx import Case
 from magshell_fenicsx.public import Result, run
 
-CASES = Path(__file__).parent
+CASES = Path(__file__).parent.parent
 
 
 # problems that others asked in public, and shells far from the ordinary ones
