@@ -47,11 +47,8 @@ from magshell_fenicsx.runs.rows import RowMaker, imbalances, motion_errors
 from magshell_fenicsx.runs.status import RunProgress, status_line
 from magshell_fenicsx.runs.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.ending import NoResult
-from magshell_fenicsx.simulate.discretisation_error import (
-    ErrorEstimates,
-    FineScenes,
-    NotEstimated,
-)
+from magshell_fenicsx.simulate.degree_comparison import NotEstimated
+from magshell_fenicsx.simulate.discretisation_error import ErrorEstimates, FineScenes
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped

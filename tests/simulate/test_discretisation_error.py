@@ -15,13 +15,12 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.public import Result, Scene, run
-from magshell_fenicsx.simulate.discretisation_error import (
-    FineScenes,
+from magshell_fenicsx.simulate.degree_comparison import (
     NotEstimated,
-    estimate_errors,
     fine_scene,
     with_higher_degree,
 )
+from magshell_fenicsx.simulate.discretisation_error import FineScenes, estimate_errors
 
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
 POLE = [*COARSE, "loading.depth=2", "loading.points=2"]

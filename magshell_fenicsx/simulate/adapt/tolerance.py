@@ -68,11 +68,8 @@ from magshell_fenicsx.simulate.adapt.ending import (
     from_near,
     values_of_all_cells,
 )
-from magshell_fenicsx.simulate.discretisation_error import (
-    SAFETY,
-    NotEstimated,
-    state_on_other_mesh,
-)
+from magshell_fenicsx.simulate.degree_comparison import NotEstimated, state_on_other_mesh
+from magshell_fenicsx.simulate.discretisation_error import SAFETY
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
