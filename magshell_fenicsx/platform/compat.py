@@ -21,7 +21,7 @@ from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
 from dolfinx.fem.forms import form_cpp_class, get_integration_domains
-from ffcx import compiler, naming
+from ffcx import naming
 from ffcx.codegeneration import get_include_path, jit
 from numpy.typing import NDArray
 from petsc4py import PETSc
@@ -65,6 +65,8 @@ def form_signature(form: ufl.Form) -> str:
 
 def form_code(form: ufl.Form) -> str:
     """Return the C code of a form, as FFCx generates it."""
+    from ffcx import compiler  # a run with compiled kernels does without
+
     generated = compiler.compile_ufl_objects([form], _form_options())
     # From FFCx 0.10 on the result has lists of files and of their endings.
     source = generated[1] if isinstance(generated[1], str) else generated[0][1]

@@ -27,6 +27,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -39,13 +40,15 @@ from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
-from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 from magshell_fenicsx.parts.penalty_contact import PenaltyOptions
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.contact_onset import CONTACT_DEPTH
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
+
+if TYPE_CHECKING:  # most scenes do without
+    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
 
 # of h: how far past the first contact the path begins, the first try first
 FIRST_CONTACT_DEPTHS = tuple(CONTACT_DEPTH / 4**i for i in range(7))
@@ -192,7 +195,7 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     empty. Collective.
     """
     scene, state = stage.scene, stage.leave(high.state)
-    closer = _numbers_of_cuts(scene, state, SurfaceContact.finer_cuts)
+    closer = _numbers_of_cuts(scene, state, lambda contact: contact.finer_cuts())
     # the instability is certain if closer points hardly change the modes beside it
     is_certain = not closer or all(_has_certain_mode(stage, point, closer) for point in (high, low))
     return {} if is_certain else closer
@@ -231,7 +234,7 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
     As shells slide on each other, segments of old cuts no longer face one cell each, and the
     quadrature becomes less exact. Collective.
     """
-    return _numbers_of_cuts(scene, state, SurfaceContact.improved_cuts)
+    return _numbers_of_cuts(scene, state, lambda contact: contact.improved_cuts())
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
@@ -239,12 +242,12 @@ def with_cuts_here(scene: Scene, state: State) -> State:
 
     Cuts belong to the mesh of a model, so numbers of another one mean nothing here.
     """
-    numbers = _numbers_of_cuts(scene, state, SurfaceContact.present_cuts)
+    numbers = _numbers_of_cuts(scene, state, lambda contact: contact.present_cuts())
     return State(state.u, {**state.mu, **numbers})
 
 
 def _numbers_of_cuts(
-    scene: Scene, state: State, make_cuts: Callable[[SurfaceContact], float | None]
+    scene: Scene, state: State, make_cuts: "Callable[[SurfaceContact], float | None]"
 ) -> dict[str, float]:
     """Return setting of a pair's cuts -> number of cuts that are made at a state; collective.
 
@@ -258,16 +261,17 @@ def _numbers_of_cuts(
     return numbers
 
 
-def _surface_contacts(scene: Scene) -> list[SurfaceContact]:
+def _surface_contacts(scene: Scene) -> "list[SurfaceContact]":
     """Return the contacts between shells on surfaces, which have cuts; those of meridians do not.
 
     They are all contacts between shells of a model on a surface.
     """
-    return [
-        shell_contact
-        for shell_contact in scene.model.shell_contacts
-        if isinstance(shell_contact, SurfaceContact)
-    ]
+    shell_contacts = scene.model.shell_contacts
+    if not shell_contacts:
+        return []
+    from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+
+    return [contact for contact in shell_contacts if isinstance(contact, SurfaceContact)]
 
 
 def with_own_contact(scene: Scene, state: State) -> State | None:

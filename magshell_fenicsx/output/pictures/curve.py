@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.mode_fields import Frequency
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.error_band import draw_error_band, errors_at_points
-from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMNS, drawing
+from magshell_fenicsx.output.pictures.layout import (
+    INCH,
+    ONE_COLUMN,
+    TWO_COLUMNS,
+    drawing,
+    place_axes,
+)
 from magshell_fenicsx.output.pictures.lines import (
     SEGMENTS_PER_INTERVAL,
     CurveStep,
@@ -91,7 +97,7 @@ def curve_figure(
             plot_curve(axes, step, pole)
             axes.set_title(step.title)
         legend(figure, max_columns=4 * min(len(steps), 2))
-        figure.draw_without_rendering()  # insets need the places of the axes
+        place_axes(figure)  # for insets
         errors_of_points = errors_at_points(rows, errors or {})
         for axes, step in zip(list(figure.axes), steps, strict=True):
             draw_hidden(axes, step)

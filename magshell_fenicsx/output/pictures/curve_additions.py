@@ -18,7 +18,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.animation import edge_of, magnification
 from magshell_fenicsx.output.pictures.curve import MARK_SIZE, draw_lines, drawn_points, legend
-from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, drawing
+from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, drawing, place_axes
 from magshell_fenicsx.output.pictures.lines import (
     CurveStep,
     axes_for,
@@ -215,7 +215,7 @@ def add_shapes(
             axes = figure.axes[curve_number]
             title = f"{axes.get_title()}; " if axes.get_title() else ""
             axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
-    figure.draw_without_rendering()  # sizes of the axes are known only then
+    place_axes(figure)  # shapes are drawn to the sizes of the axes
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
     occupied = dict[int, list[Array]]()  # number of a curve -> boxes of the shapes drawn so far
     for number, (row, _), surface in zip(curve_numbers, shapes, magnified, strict=True):

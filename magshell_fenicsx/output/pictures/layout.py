@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window, axes_on_screen
-from magshell_fenicsx.output.pictures.scales import Scale, colour_bar
+from magshell_fenicsx.output.pictures.scales import Scale, colour_bar, pixel_canvas
 from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -448,6 +448,14 @@ def _letter_place(end: Array, size: float, others: Sequence[Array]) -> Array:
     return np.asarray(places[0])
 
 
+def place_axes(figure: "Figure") -> None:
+    """Give the axes of a figure the places of its layout, which they get only when it is drawn."""
+    pixel_canvas(figure)  # it measures the texts
+    layout = figure.get_layout_engine()
+    assert layout
+    layout.execute(figure)
+
+
 def _wrapped(text: str, inches: float, size: float) -> list[str]:
     """Return a text in lines that fit into a width in inches; `size` is the font's in points."""
     import textwrap
@@ -471,10 +479,9 @@ DATE_KEYS = {"svg": "Date", "pdf": "CreationDate"}  # of metadata
 
 def png(figure: "Figure") -> bytes:
     """Return a figure as a PNG file, without the channel of opacity that Matplotlib writes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Pillow
 
-    canvas, content = FigureCanvasAgg(figure), io.BytesIO()
+    canvas, content = pixel_canvas(figure), io.BytesIO()
     canvas.draw()
     colours = Pillow.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     colours.save(content, "PNG", dpi=(figure.dpi, figure.dpi), compress_level=COMPRESSION_LEVEL)

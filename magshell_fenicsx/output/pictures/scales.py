@@ -12,6 +12,7 @@ import numpy as np
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.text import Text
@@ -170,11 +171,20 @@ def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
     return [tick for tick in ticks if end_distance < (tick - low) / (high - low) < 1 - end_distance]
 
 
-def _fit_into(title: "Text", room: float, figure: "Figure") -> None:
-    """Write a text of a figure smaller if it is wider than `room`, in inches."""
+def pixel_canvas(figure: "Figure") -> "FigureCanvasAgg":
+    """Return the canvas that draws a figure in pixels, the same one each time.
+
+    So its texts are measured and drawn by one renderer: each one parses formulas anew.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    renderer = FigureCanvasAgg(figure).get_renderer()
+    canvas = figure.canvas
+    return canvas if isinstance(canvas, FigureCanvasAgg) else FigureCanvasAgg(figure)
+
+
+def _fit_into(title: "Text", room: float, figure: "Figure") -> None:
+    """Write a text of a figure smaller if it is wider than `room`, in inches."""
+    renderer = pixel_canvas(figure).get_renderer()
     title_width = title.get_window_extent(renderer).width / figure.dpi
     reduction = min(1.0, room / title_width)  # a short caption keeps its size
     title.set_fontsize(float(title.get_fontsize()) * reduction)

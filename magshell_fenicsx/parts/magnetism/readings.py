@@ -184,11 +184,11 @@ class SensorsObservables(Observables):
         CaseError
             With the sensor.
         """
-        from scipy.spatial import cKDTree
-
         # nodes in space: a mesh file; charts (n, 2) were tested by `sensors.depth`
         if not loads.sensors or surface.nodes.shape[1] < 3:
             return
+        from scipy.spatial import cKDTree  # takes long to import
+
         corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
         # 45 places on each flat triangle, by barycentric coordinates in steps of 1/8
         barycentric = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
