@@ -51,7 +51,7 @@ def test_a_flat_contact_has_the_pressure_of_its_points() -> None:
     """
     few = "loading.approach=0.8", "loading.points=1", "mesh.refinement=4"
     scene, state, surface = end_of("plate_contact.yaml", "bodies.plate.stiffness=2e6", *few)
-    pressing, _ = scene.model.contacts["approach"]
+    pressing = scene.model.contacts["approach"]
     sizes = scene.model.system.at_state(state).evaluate(pressing._pressures)
     drawn = surface.fields[PRESSURE]
     assert np.nanmax(drawn) == pytest.approx(sizes.max(), rel=0.33)

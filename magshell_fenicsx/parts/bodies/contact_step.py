@@ -258,8 +258,7 @@ class BodiesObservables(Observables):
             region, potential = model.region(state, name), view.potential(state, name)
             force = -potential / self._unit(view)
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
-            body_contact, _ = model.contacts[name]
-            stiffness = float(body_contact.stiffness.value)
+            stiffness = float(model.contacts[name].stiffness.value)
             # in the order of `contact_columns`
             numbers = state.mu[name], force, region.penetration / h, *radii, stiffness
             values |= dict(zip(contact_columns(name), numbers, strict=True))
