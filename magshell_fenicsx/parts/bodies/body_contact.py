@@ -42,6 +42,7 @@ from magshell_fenicsx.parts.penalty_contact import (
     PASS_THROUGH_DISTANCE,
     GapAlongStep,
     PenaltyContact,
+    PressedPoints,
 )
 
 Array = NDArray[np.float64]
@@ -235,12 +236,15 @@ class Region:
     radius, inner, outer
         Mean, least and largest distance of the contact pressure from the axis of the approach; 0
         without contact.
+    pressure
+        Largest contact pressure at the points, over E h/R.
     """
 
     penetration: float
     radius: float
     inner: float
     outer: float
+    pressure: float
 
 
 @dataclass(frozen=True)
@@ -714,6 +718,17 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         """Return the contact pressure at the points of local cells (cells, points), over E h/R."""
         return np.asarray(np.linalg.norm(self._tractions(), axis=-1))
 
+    def pressed_points(self) -> PressedPoints:
+        pressures, area = self._pressures()[: self._owned], self._area_memo.renew()[: self._owned]
+        places = self._placement_memo.renew() + at_quadrature(self._u, self._points)
+        cell, point = np.nonzero(pressures)
+        return PressedPoints(
+            places[cell, point],
+            pressures[cell, point],
+            area[cell, point],
+            area.sum(axis=1)[cell],
+        )
+
     def forces_and_moments(self) -> tuple[Array, Array]:
         """Return the forces on the body at the points of own cells, and their moments.
 
@@ -748,4 +763,4 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
         # without contact the least distance is that of no points, infinite
-        return Region(penetration, radius, inner if largest else 0.0, outer)
+        return Region(penetration, radius, inner if largest else 0.0, outer, largest)

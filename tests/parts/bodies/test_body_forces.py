@@ -10,16 +10,24 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_bvp
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.output.fields.contact_peak import contact_peak
 from magshell_fenicsx.simulate.follow import follow
 
 Array = NDArray[np.float64]
 Row = dict[str, float]
 
 
+def ends(**sections: Any) -> tuple[Scene, list[State]]:
+    """Return the scene of a case, and the states at the targets of its steps."""
+    scene = Scene(Case.from_source({"reactions": True, **sections}))
+    return scene, [r.point.state for r in follow(scene) if r.label == "target"]
+
+
 def targets(**sections: Any) -> list[Row]:
     """Return what is observed at the targets of a case's steps."""
-    scene = Scene(Case.from_source({"reactions": True, **sections}))
-    return [scene.observe(r.point.state) for r in follow(scene) if r.label == "target"]
+    scene, states = ends(**sections)
+    return [scene.observe(state) for state in states]
 
 
 def vector(row: Row, name: str, kind: str) -> Array:
@@ -160,12 +168,12 @@ def squeezed_ring(approach: float) -> float:
 
 @pytest.mark.slow
 def test_a_ring_between_plates() -> None:
-    """Half of it flat: the force is the elastica's while it touches along one line, and along two,
-    1e-3.
+    """The force is the elastica's while it touches along one line, and along two, 1e-3; so is the
+    force per length that pictures name, within some per cent.
     """
     thickness, width, approaches = 0.02, 0.12, (15, 35)
     edges = "left", "right", "bottom", "top"
-    rows = targets(
+    scene, states = ends(
         shell={
             "geometry": "cylinder", "radius": 1, "length": width, "thickness": thickness,
             "youngs_modulus": 1, "poisson_ratio": 0, "azimuth": [0, 90],
@@ -175,9 +183,12 @@ def test_a_ring_between_plates() -> None:
         mesh={"degree": 3, "size": 0.1},
         loading=[{"kind": "contact", "approach": a, "points": 1} for a in approaches],
     )  # fmt: skip
-    for approach, row in zip(approaches, rows, strict=True):
+    for approach, state in zip(approaches, states, strict=True):
+        row, peak = scene.observe(state), contact_peak(scene.model, state)
         force = squeezed_ring(approach * thickness) * width * thickness**3 / 12
         assert row["plate_contact_fy"] == pytest.approx(force, rel=1e-3)
+        assert peak is not None
+        assert peak.line_force == pytest.approx(force / (width * thickness), rel=0.05)
         assert sum(row[f"{edge}_fy"] for edge in edges) == pytest.approx(
             row["plate_contact_fy"], rel=1e-8
         )
