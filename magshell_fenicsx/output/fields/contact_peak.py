@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 REACH_ALONG_LINE = 2.3  # square roots of a cell's area: some one and a half sides
+MAX_WIDTH_OF_LINE = 0.5  # over its length
+MOST_POINTS = 200  # around which the force per length is computed
 
 
 @dataclass(frozen=True)
@@ -75,12 +77,28 @@ def _along_meridian(points: PressedPoints, forces: Array) -> float:
 
 
 def _along_surface(points: PressedPoints, forces: Array) -> float:
-    """Return the median of the forces per length, each from the points on both sides of a point."""
-    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area)
-    if np.ptp(points.places, axis=0).max() < 2 * reach.max():
+    """Return the median of the forces per length around points; nan if most are in spots."""
+    count = len(forces)
+    chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[chosen])
+    neighbours = cKDTree(points.places).query_ball_point(points.places[chosen], reach)
+    of_points = np.array([_per_length(points.places[near], forces[near]) for near in neighbours])
+    is_line, weights = np.isfinite(of_points), forces[chosen]
+    if weights[is_line].sum() < weights.sum() / 2:
         return nan
-    neighbours = cKDTree(points.places).query_ball_point(points.places, reach)
-    of_points = np.array([forces[near].sum() for near in neighbours]) / (2 * reach)
-    order = np.argsort(of_points)
-    middle = np.searchsorted(np.cumsum(forces[order]), forces.sum() / 2)
-    return float(of_points[order][middle])
+    order = np.argsort(of_points[is_line])
+    weights = weights[is_line][order]
+    middle = np.searchsorted(np.cumsum(weights), weights.sum() / 2)
+    return float(of_points[is_line][order][middle])
+
+
+def _per_length(places: Array, forces: Array) -> float:
+    """Return the sum of forces (n,) at places (n, 3) over the length of their line; nan of a spot.
+
+    An even force on a straight line of the length L has the variance L²/12 along it.
+    """
+    from_middle = places - forces @ places / forces.sum()
+    covariance = (forces[:, None] * from_middle).T @ from_middle / forces.sum()
+    *_, across, along = np.linalg.eigvalsh(covariance)
+    is_spot = across > MAX_WIDTH_OF_LINE**2 * along
+    return nan if is_spot or not along else float(forces.sum() / np.sqrt(12 * along))
