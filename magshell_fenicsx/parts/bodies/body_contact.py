@@ -741,7 +741,7 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         # relative to the body, which is then at approach zero
         places = (self._placement_memo.renew() + self.place)[own]
         arms = places - (body.front - body.front_offset * body.direction)
-        return forces, np.cross(arms, forces)
+        return forces, np.asarray(np.cross(arms, forces), np.float64)
 
     def region(self) -> Region:
         """Return the region where the body touches the shell; collective."""

@@ -510,7 +510,8 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
         places = np.einsum("nf,nfi->ni", points.shape[joined_points], nodal)
         if places.shape[1] == 2:  # of a meridian
             places = np.insert(places, 1, 0.0, axis=1)
-        cell_area = np.bincount(points.cell - first_cell, points.weight, count)[cell - first_cell]
+        area_of_cells = np.bincount(points.cell - first_cell, points.weight, count)
+        cell_area = np.asarray(area_of_cells[cell - first_cell], np.float64)
         # half, since the points of both members have the same force
         area = active.area[is_pressed] / 2
         return PressedPoints(places, pressures[is_pressed], area, cell_area)
