@@ -7,6 +7,7 @@ present. All are of the whole shell on the body. docs/theory.md, Contact.
 """
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,7 +40,7 @@ class BodyForcesObservables(Observables):
         model, values = view.model, dict[str, float]()
         evaluation, frame = model.system.at_state(state), rotation(view.azimuth)
         for contact in model.contacts.values():
-            sums = evaluation.evaluate(lambda contact=contact: _sums(contact, model))
+            sums = evaluation.evaluate(partial(_sums, contact, model))
             force, moment = _of_whole(sums[:3], sums[3:6], model, view.mirror)
             numbers = (
                 *(sums[6:] / model.force_unit),
