@@ -542,7 +542,7 @@ def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[ContactBody, 
     A body whose amplitude has the name of a load step is moved by that step.
     """
     driven_names = {step.name for step in case.programme}
-    return contact_bodies(case.bodies, case.approaches, driven_names, reference)
+    return contact_bodies(case.bodies, case.approaches, driven_names, reference, case.shells or ())
 
 
 @dataclass(frozen=True)

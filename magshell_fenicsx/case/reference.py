@@ -64,7 +64,12 @@ pictures, report and sweeps then show these. Named points add `NAME_ux`, `NAME_u
 the unit of the shell's lengths. Where supports move, or with `reactions: true`, every support adds
 its reaction on the shell: the forces `NAME_fx`, `NAME_fy` and `NAME_fz`, and the moments `NAME_mx`,
 `NAME_my` and `NAME_mz` about the middle of the support's bounding box, where the support is now; in
-N and N m if the case has units, else in its own (over E R² and E R³ if it has no lengths). A
+N and N m if the case has units, else in its own (over E R² and E R³ if it has no lengths). Every
+body of `bodies` adds its forces of contact: `NAME_normal_force`, the integral of the contact
+pressure whatever its direction, over 2πD/R (`NAME_normal_force_N` with units), of several shells
+`NAME_SHELL_normal_force` too; the resultant on the body, `NAME_contact_fx`, `NAME_contact_fy` and
+`NAME_contact_fz`, and its moment about the body's reference point (where its `position` is, at
+present), `NAME_contact_mx`, `NAME_contact_my` and `NAME_contact_mz`, in the units of reactions. A
 user-defined energy adds a column with its name: its amplitude.
 """
 AMPLITUDES_HEAD = """

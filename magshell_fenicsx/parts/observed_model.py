@@ -53,8 +53,7 @@ class ObservedModel(Protocol):
         Column -> form over the modelled part, of what the user's terms observe and of the
         polarisation that a field induces.
     contacts
-        Approach of a body -> the state of its contact, and the forms of the integrals of its
-        pressure.
+        Approach of a body -> the state of its contact.
     """
 
     system: "FiniteElementSystem"
@@ -68,11 +67,15 @@ class ObservedModel(Protocol):
     supports: "Mapping[str, Support]"
     without_potential: tuple[str, ...]
     observed: "dict[str, fem.Form]"
-    contacts: "dict[str, tuple[BodyContact, Mapping[str, fem.Form]]]"
+    contacts: "dict[str, BodyContact]"
 
     @property
     def shell_contacts(self) -> "Sequence[PairContact[Any]]":
         """The contacts of parts of the shell with each other, or with itself."""
+
+    @property
+    def shell_cells(self) -> "Mapping[str, NDArray[np.bool_]]":
+        """Name of each of several shells -> flags (cells,) of its local cells; empty for one."""
 
     @property
     def part_caches(self) -> dict[type, Any]:

@@ -7,11 +7,12 @@ of a motion in time; the way of a step is straight between its two configuration
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.gap import SOFT_PENETRATION, Penalty
@@ -64,6 +65,38 @@ class GapAlongStep:
     gap: Callable[[float], float]
     largest_approach: float
     crossing_distance: float
+
+
+@dataclass(frozen=True)
+class PressedPoints:
+    """The quadrature points of contacts where the gap is closed.
+
+    Attributes
+    ----------
+    places
+        (n, 3) deformed places over R.
+    pressure
+        (n,) contact pressure over E h/R.
+    area
+        (n,) the area over R² that a point stands for in the force, on a meridian that of its ring.
+    cell_area
+        (n,) the area over R² of the cell of a point, on a meridian that of its ring.
+    """
+
+    places: Array
+    pressure: Array
+    area: Array
+    cell_area: Array
+
+    @classmethod
+    def gathered(cls, parts: "Sequence[PressedPoints]", comm: MPI.Comm) -> "PressedPoints":
+        """Return the points of several contacts and of all ranks as one set; collective."""
+        tables = [
+            np.column_stack([part.places, part.pressure, part.area, part.cell_area])
+            for part in parts
+        ]
+        table = np.concatenate(comm.allgather(np.concatenate(tables)))
+        return cls(table[:, :3], *table[:, 3:].T)
 
 
 class PenaltyContact(ABC, Generic[Configuration, Frozen]):
@@ -136,6 +169,10 @@ class PenaltyContact(ABC, Generic[Configuration, Frozen]):
     @abstractmethod
     def evenly_pressed(self) -> NDArray[np.bool_]:
         """Return the flags (cells,) of local cells that are pressed evenly, all over."""
+
+    @abstractmethod
+    def pressed_points(self) -> PressedPoints:
+        """Return the points of this rank where the gap is closed, with their pressure."""
 
     @abstractmethod
     def freeze(self) -> Frozen:

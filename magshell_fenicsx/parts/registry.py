@@ -54,6 +54,7 @@ REGISTERED: dict[str, tuple[str, ...]] = {
         "magnetism.interaction.InteractionObservables",
         "magnetism.readings.SensorsObservables",
         "bodies.contact_step.BodiesObservables",
+        "bodies.body_forces.BodyForcesObservables",
         "contact.contact_observables.ContactObservables",
         "joints.CreaseObservables",
         "shell_observables.EnergyObservables",

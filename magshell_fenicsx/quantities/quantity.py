@@ -137,6 +137,7 @@ VOLUME = Unit("R³", "m³", "mm3", "mm³", lambda g: 1e9 * g.R**3, text="millime
 POINT_FORCE = Unit("2πD/R", "N", "N", "N", lambda g: g.force, text="newton")
 ENERGY = Unit("E h R²", "J", "mJ", "mJ", lambda g: 1e3 * g.E * g.h * g.R**2)
 STIFFNESS = Unit("E h/R²", "N/m³", "N_per_m3", "N/m³", lambda g: g.E * g.h / g.R**2)
+CONTACT_PRESSURE = Unit("E h/R", "Pa", "Pa", "Pa", lambda g: g.E * g.h / g.R)
 FIELD = Unit(
     "λ_m",
     "mT",

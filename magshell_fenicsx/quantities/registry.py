@@ -295,8 +295,9 @@ def told_quantity(name: str) -> Quantity | None:
     """Return the quantity that the name of a dimensionless column tells; None if it tells none.
 
     Not registered are the columns of a second load ("force_2"), of its displacement
-    ("w_force_2_over_h"), of one of several bodies, and of the displacement, reaction or moment of a
-    named place ("rim_ux"). The factor of a motion or of a user's energy has any name.
+    ("w_force_2_over_h"), of one of several bodies, of the forces on a body ("ball_normal_force"),
+    and of the displacement, reaction or moment of a named place ("rim_ux"). The factor of a motion
+    or of a user's energy has any name.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
@@ -327,7 +328,9 @@ def told_quantity(name: str) -> Quantity | None:
     if families:
         longest = max(families, key=lambda q: len(q.name))
         return longest.for_name(name.removeprefix(f"{longest.name}_"))
-    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis
+    if name.endswith("_normal_force"):  # of a body, and perhaps of one shell on it
+        return Quantity(name, name.replace("_", " "), "", "reaction", units=(POINT_FORCE,))
+    # of a named point, support or body: the displacement (u), force (f) or moment (m) along an axis
     kinds_and_units: dict[str, tuple[Kind, Unit]] = {
         "u": ("place", PLACE),
         "f": ("reaction", REACTION),

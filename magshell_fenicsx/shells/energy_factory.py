@@ -61,8 +61,6 @@ from magshell_fenicsx.parts.bodies.body_contact import (
     BodyContact,
     ContactBody,
     contact_energy,
-    contact_pressure,
-    radius_density,
     thinned_energy,
 )
 from magshell_fenicsx.parts.gap import thickness_ratio_at_points
@@ -574,8 +572,8 @@ class EnergyFactory:
             }
         return {column: self._over_area(density) for column, density in by_column.items()}
 
-    def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact, dict[str, ufl.Form]]:
-        """Return the energy of contact with a rigid body, its state, and its integrals.
+    def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact]:
+        """Return the energy of contact with a rigid body, and its state.
 
         Returns
         -------
@@ -583,9 +581,6 @@ class EnergyFactory:
             Penalty energy; the body's approach is a free parameter.
         body_contact
             State of the contact at quadrature points.
-        integrals
-            "pressure": form of the pressure over the area. "radius": form of pressure times
-            distance from the body's axis.
         """
         domain = self.domain
         # the body's displacement towards the shell over h, an amplitude
@@ -597,7 +592,7 @@ class EnergyFactory:
                 domain, self.u, self.natural, self.law_of_cells.thins
             )
         body_contact = BodyContact(
-            contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
+            contact, self.material.h, domain, self.u, approach, self.thickness, thins_at
         )
         parameters = body_contact.parameters
         # the gap depends on the place; where the shell thins, on its stretch too
@@ -607,20 +602,7 @@ class EnergyFactory:
             )
         else:
             density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
-        # pressure times the distance from the body's axis
-        radius_function = radius_density(
-            self._constant(contact.front), self._constant(contact.direction)
-        )
-        density_functions: dict[str, Callable[..., Expr]] = {
-            "pressure": contact_pressure,
-            "radius": radius_function,
-        }
-        by_name = {
-            name: Density(per_area(density_function), parameters, quadrature=rule)
-            for name, density_function in density_functions.items()
-        }
-        integrals = {name: self._over_area(density) for name, density in by_name.items()}
-        return domain.energy(f"contact {contact.body}", density), body_contact, integrals
+        return domain.energy(f"contact {contact.body}", density), body_contact
 
     def _over_area(self, density: Density) -> ufl.Form:
         """Return the integral of a density at u over the modelled part."""

@@ -388,6 +388,10 @@ class MeridianModel(ThinModel):
         }
         self.normals = {name: probe.normal for name, probe in self._probe_by_point.items()}
 
+    @property
+    def shell_cells(self) -> Mapping[str, NDArray[np.bool_]]:
+        return self.meridian.patches
+
     def _make_shell_contacts(self) -> "Sequence[MeridianContact]":
         """Return the contacts between parts of the shell; empty without contact pairs."""
         if not self.loads.pairs:

@@ -82,8 +82,7 @@ class ModelBase:
         Column -> form over the modelled part, of what the user's terms observe and of the
         polarisation that a field induces.
     contacts
-        Approach of a body -> the state of its contact, and the forms of the integrals of its
-        pressure: "pressure", and "radius" with the distance from the axis as weight.
+        Approach of a body -> the state of its contact.
     shell_contacts
         The contacts of parts of the shell with each other, or with itself.
     planes
@@ -116,7 +115,7 @@ class ModelBase:
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
-    contacts: dict[str, tuple[BodyContact, Mapping[str, fem.Form]]]
+    contacts: dict[str, BodyContact]
     shell_contacts: "Sequence[PairContact[Any]]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
@@ -249,19 +248,19 @@ class ModelBase:
     def region(self, state: State, approach: str) -> Region:
         """Return the region where a body touches the shell; collective.
 
-        `approach` is the amplitude of the body's approach, the key of `contacts`. The mean radius
-        of the contact is the mean distance from the body's axis, weighted with the pressure.
+        `approach` is the amplitude of the body's approach, the key of `contacts`.
         """
-        body_contact, forms = self.contacts[approach]
-        evaluation = self.system.at_state(state)
-        pressure, moment = (evaluation.integral(forms[name]) for name in ("pressure", "radius"))
-        mean_radius = moment / pressure if pressure else 0.0
-        return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
+        return self.system.at_state(state).evaluate(self.contacts[approach].region)
 
     @property
     def all_contacts(self) -> list[PenaltyContact[Any, Any]]:
         """All contacts: with bodies, then of parts of the shell."""
-        return [*(body_contact for body_contact, _ in self.contacts.values()), *self.shell_contacts]
+        return [*self.contacts.values(), *self.shell_contacts]
+
+    @property
+    def shell_cells(self) -> Mapping[str, NDArray[np.bool_]]:
+        """Name of each of several shells -> flags (cells,) of its local cells; empty for one."""
+        return {}
 
     @property
     def contact_history(self) -> dict[str, tuple[Any, float]]:
@@ -379,10 +378,8 @@ class ThinModel(ModelBase):
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}
         for contact in self.loads.contacts:
-            # energy, state of the contact, and forms of the integrals of its pressure
-            energy, body_contact, integrals = factory.contact(contact)
+            energy, self.contacts[contact.amplitude] = factory.contact(contact)
             energies.append(energy)
-            self.contacts[contact.amplitude] = body_contact, self.kernels.compile_all([integrals])
         return energies
 
     @property

@@ -525,6 +525,10 @@ class ShellModel(ThinModel):
             terms += [self.factory.term(energy) for energy in energies]
         return terms
 
+    @property
+    def shell_cells(self) -> Mapping[str, NDArray[np.bool_]]:
+        return {name: self.midsurface.patches[name] for name in self.midsurface.shells}
+
     def _make_shell_contacts(self) -> "Sequence[PairContact[Any]]":
         """Return the contacts between parts of the shell, as terms; empty without contact pairs."""
         if not self.loads.pairs:

@@ -664,7 +664,7 @@ def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
     evaluation = scene.model.system.at_state(state)
     return [
         body_contact.contact
-        for body_contact, _ in scene.model.contacts.values()
+        for body_contact in scene.model.contacts.values()
         if evaluation.evaluate(body_contact.penetration) > 0
     ]
 

@@ -264,9 +264,8 @@ def expand_contact(scene: Scene, other: Scene, state: State) -> None:
     expand_shell_contact(scene, other, state)
     evaluation = scene.model.system.at_state(state)
     # the same body in both scenes
-    for name, (body_contact, _) in scene.model.contacts.items():
-        other_contact, _ = other.model.contacts[name]
-        other_contact.expand_about(evaluation.evaluate(body_contact.freeze))
+    for name, body_contact in scene.model.contacts.items():
+        other.model.contacts[name].expand_about(evaluation.evaluate(body_contact.freeze))
 
 
 def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:

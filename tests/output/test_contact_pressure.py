@@ -10,6 +10,7 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.output.fields.contact_peak import _along_surface
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import (
     GAP_OPEN,
@@ -20,6 +21,7 @@ from magshell_fenicsx.output.fields.surface import (
     resolved_pressure,
 )
 from magshell_fenicsx.output.pictures.colours import contact, pressure_note
+from magshell_fenicsx.parts.penalty_contact import PressedPoints
 from magshell_fenicsx.simulate.follow import follow
 
 
@@ -37,11 +39,19 @@ def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
     """The rod's edge presses on a ring of 0.02 of a cell; its mean over the cell was drawn, 50
     times too small.
     """
-    _, _, surface = end_of("rod_contact.yaml", "loading.approach=0.5", "loading.points=1")
+    few = "loading.approach=0.5", "loading.points=1"
+    scene, state, surface = end_of("rod_contact.yaml", *few)
     assert np.isnan(surface.fields[PRESSURE]).any()
     assert not (surface.fields[PRESSURE] > 0).any()
     assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
     assert "narrower than a cell" in pressure_note(surface)
+    row, h = scene.observe(state), scene.problem.material.h
+    ring = 2 * np.pi * row["contact_radius"] / scene.problem.length
+    force = row["rod_normal_force"] * 2 * np.pi * h**2 / 12 / (1 - 0.5**2)  # over E h R
+    assert surface.contact_peak is not None
+    assert surface.contact_peak.line_force == pytest.approx(force / ring, rel=1e-3)
+    assert surface.contact_peak.force == pytest.approx(force)
+    assert f"{force / ring:.3g} $Eh$" in pressure_note(surface)
 
 
 @pytest.mark.slow
@@ -51,10 +61,11 @@ def test_a_flat_contact_has_the_pressure_of_its_points() -> None:
     """
     few = "loading.approach=0.8", "loading.points=1", "mesh.refinement=4"
     scene, state, surface = end_of("plate_contact.yaml", "bodies.plate.stiffness=2e6", *few)
-    pressing, _ = scene.model.contacts["approach"]
-    sizes = scene.model.system.at_state(state).evaluate(pressing._pressures)
-    drawn = surface.fields[PRESSURE]
-    assert np.nanmax(drawn) == pytest.approx(sizes.max(), rel=0.33)
+    largest, drawn = scene.observe(state)["contact_pressure_max"], surface.fields[PRESSURE]
+    assert np.nanmax(drawn) == pytest.approx(largest, rel=0.33)
+    assert surface.contact_peak is not None
+    assert surface.contact_peak.pressure == pytest.approx(largest)
+    assert f"{largest:.3g}" in pressure_note(surface)
     assert (surface.fields["gap_over_h"][drawn > 0] < 0.05).all()
 
 
@@ -76,12 +87,31 @@ def test_pressure_of_cells_pressed_in_part() -> None:
     assert found[PRESSURE] == pytest.approx([0, 1, 1, 0, 0, np.nan, np.nan], nan_ok=True)
 
 
+@pytest.mark.parametrize("rows", [1, 2])
+def test_force_per_length(rows: int) -> None:
+    """Points along a line, on one side of an edge or on both: 3 per length, whatever their rows; a
+    spot has none.
+    """
+    x, size = np.arange(0, 1, 0.01), 0.02
+    offsets = np.tile([0.0, 0.004][:rows], len(x))
+    places = np.column_stack([np.repeat(x, rows), offsets, 0 * offsets])
+    points = PressedPoints(
+        places,
+        np.full(len(places), 3e4 / rows),
+        *(np.full(len(places), a) for a in (1e-6, size**2)),
+    )
+    found = _along_surface(points, points.pressure * points.area)
+    assert found == pytest.approx(3, rel=0.05)
+    square = np.random.default_rng(1).uniform(0, 0.01, places.shape) * [1, 1, 0]
+    spot = replace(points, places=square)
+    assert np.isnan(_along_surface(spot, points.pressure * points.area))
+
+
 def test_nothing_touches() -> None:
-    """No pressure is drawn, in place of a bar from 0 to 1."""
+    """Nothing is drawn, in place of a bar from 0 to 1."""
     points = np.zeros((3, 3))
     fields = {PRESSURE: np.zeros(3), "gap_over_h": np.full(3, 2.0)}
     surface = Surface(points, points, points, np.array([[0, 1, 2]]), fields)
-    assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
-    assert pressure_note(surface) == "Nothing touches."
+    assert contact(surface) == []
     pressed = replace(surface, fields=fields | {PRESSURE: np.array([1.0, 2.0, np.nan])})
     assert [layer.limits for layer in contact(pressed)][1] == (0.0, 2.0)

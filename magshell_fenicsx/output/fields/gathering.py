@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding
 from magshell_fenicsx.models.shell.spatial_fields import inside_cells
+from magshell_fenicsx.output.fields.contact_peak import contact_peak
 from magshell_fenicsx.output.fields.point_fields import (
     PointFields,
     Stresses,
@@ -196,6 +197,7 @@ class RevolvedGatherer:
             jump=jumps["M"],
             strain_jump=jumps["E"],
             shells=self._model.meridian.shells,
+            contact_peak=contact_peak(self._model, state) if state.mu else None,
         )
 
     def _swept_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:

@@ -33,6 +33,7 @@ from magshell_fenicsx.mesh.mirror import Mirror, Sector, rotation
 from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.law import Law, LawByShell
 from magshell_fenicsx.models.shell.spatial_fields import inside_cells
+from magshell_fenicsx.output.fields.contact_peak import ContactPeak, contact_peak
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
 from magshell_fenicsx.output.fields.recovery import (
     RecoveredShell,
@@ -98,6 +99,8 @@ class Surface:
     shells
         Names of several shells, in the order of their numbers in the field `shell`. Nodes that two
         shells share are double.
+    contact_peak
+        Largest pressure and force per length of the contact; None without touch.
     """
 
     r0: Array
@@ -110,6 +113,7 @@ class Surface:
     strain_jump: float | None = None
     solids: tuple[Solid, ...] = ()
     shells: tuple[str, ...] = ()
+    contact_peak: ContactPeak | None = None
 
     @property
     def is_body(self) -> bool:
@@ -326,6 +330,7 @@ class SurfaceGatherer:
 
         if state.mu:  # of a mode there are no amplitudes, and no contact
             add_contact(values, self._model, state, at_cell_nodes)
+        peak = contact_peak(self._model, state) if state.mu else None
         averaged = {
             name: self._averaged(values_at_cells) for name, values_at_cells in values.items()
         }
@@ -353,6 +358,7 @@ class SurfaceGatherer:
             jump=jumps["M"],
             strain_jump=jumps["E"],
             shells=self._model.midsurface.shells,
+            contact_peak=peak,
         )
 
     def _shell_numbers(self) -> Array:
@@ -573,6 +579,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         strain_jump=surface.strain_jump,
         solids=surface.solids,
         shells=surface.shells,
+        contact_peak=surface.contact_peak,
     )
 
 

@@ -9,7 +9,7 @@ lengths in the files are over R.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from math import isnan, nan
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.fields.contact_peak import ContactPeak
 from magshell_fenicsx.output.fields.outlines import read_outlines, vtp_content
 from magshell_fenicsx.output.fields.surface import (
     LAGRANGE_HEXAHEDRON,
@@ -42,6 +43,7 @@ Read = TypeVar("Read")
 VTK_TENSOR_INDICES = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])
 VTK_TENSOR_POSITIONS = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
+PEAK = "contact_peak"  # largest pressure, force per length, force: over E h/R, E h, E h R
 SHELLS = "shells"  # names of the shells, in the order of the numbers in `shell`
 DATA_OF_SURFACE = ("u", "u_over_h", "w_over_h", "r0", "n0")
 STRENGTH = quantity(FIELD.column).ascii_symbol  # of the applied field
@@ -255,6 +257,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
         jump=moment_jump,
         strain_jump=strain_jump,
         shells=_shell_names(grid.GetFieldData()),
+        contact_peak=ContactPeak(*map(float, file_arrays[PEAK])) if PEAK in file_arrays else None,
     )
     return surface, shell_data
 
@@ -476,6 +479,8 @@ def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
     }
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
     file_arrays |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
+    peak = surface.contact_peak
+    file_arrays[PEAK] = None if peak is None else np.array(astuple(peak))
     file_arrays |= {"R_in_m": None if isnan(shell_data.R) else np.array([shell_data.R])}
     for name, values in file_arrays.items():
         if values is not None:

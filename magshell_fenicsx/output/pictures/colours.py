@@ -14,10 +14,12 @@ stiffness.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import isnan
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.output.fields.contact_peak import ContactPeak
 from magshell_fenicsx.output.fields.surface import SHELL, Surface
 from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, from_zero
 
@@ -333,11 +335,13 @@ def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
 def contact(surface: Surface) -> list[ColouredField]:
     """Return gap and contact pressure as coloured fields.
 
-    Empty without contact; the gap alone where the mesh resolves no pressure.
+    Empty where nothing touches; the gap alone where the mesh resolves no pressure.
     """
     if not {"gap_over_h", "contact_pressure"} <= surface.fields.keys():
         return []
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
+    if not (np.isnan(pressure).any() or pressure.any()):
+        return []
     layers = [ColouredField("gap_over_h", gap, (0.0, 1.0), DISTANCE, "gap$/h$")]
     if (largest := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
         caption = r"contact pressure $pR/(Eh)$"
@@ -346,24 +350,33 @@ def contact(surface: Surface) -> list[ColouredField]:
 
 
 def pressure_note(surface: Surface) -> str:
-    """Return the note under the contact pressure; empty without one.
+    """Return the note under the contact pressure.
 
-    It says that nothing is in contact, that no cell resolves the pressure, or that few cells carry
-    it.
+    It says that no cell resolves the pressure, and the force per length; or the largest pressure
+    at a quadrature point, and that few cells carry it.
     """
     pressure = surface.fields["contact_pressure"]
     # a pressure is nan where the contact is narrower than a cell
     is_unresolved, largest = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
+    peak = surface.contact_peak
     if not largest:
-        if not is_unresolved:
-            return "Nothing touches."
-        return "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
+        words = "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
+        return f"{words} {_line_force_text(peak)}".strip() if peak else words
+    notes = []
     if is_unresolved:
-        return "Where the contact is narrower than a cell of the mesh, no pressure is drawn."
-    number = int((pressure[surface.cells] > 0).all(axis=1).sum())
-    if 0 < number < MIN_PRESSED_CELLS:
-        return f"The pressure is a mean over each cell; {number} carry it."
-    return ""
+        notes = ["Where the contact is narrower than a cell of the mesh, no pressure is drawn."]
+    elif 0 < (number := int((pressure[surface.cells] > 0).all(axis=1).sum())) < MIN_PRESSED_CELLS:
+        notes = [f"The pressure is a mean over each cell; {number} carry it."]
+    if peak:
+        notes.append(f"The largest at a quadrature point is $pR/(Eh)$ = {peak.pressure:.3g}.")
+    return " ".join(notes)
+
+
+def _line_force_text(peak: ContactPeak) -> str:
+    """Return a sentence on the force of a contact whose pressure the mesh does not resolve."""
+    if isnan(peak.line_force):
+        return f"Its force is {peak.force:.3g} $EhR$."
+    return f"Its force per length is {peak.line_force:.3g} $Eh$."
 
 
 def contact_region(surface: Surface) -> Array | None:

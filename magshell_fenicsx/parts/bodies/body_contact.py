@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.memo import Memo, PointField, at_quadrature
+from magshell_fenicsx.models.domains import IntegrationDomain
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.parts.bodies.body import Distance
 from magshell_fenicsx.parts.gap import ThicknessRatio, thickness_ratio
@@ -41,6 +42,7 @@ from magshell_fenicsx.parts.penalty_contact import (
     PASS_THROUGH_DISTANCE,
     GapAlongStep,
     PenaltyContact,
+    PressedPoints,
 )
 
 Array = NDArray[np.float64]
@@ -77,6 +79,10 @@ class ContactBody:
         Radius over R of the part that touches, such as a ball's; infinite for a plane.
     has_given_stiffness
         Whether the case gives the stiffness, which then stays.
+    front_offset
+        Distance over R of its front from its reference point, such as the centre of a ball.
+    shells
+        Names of the shells that it may touch, where there are several.
     start, lift
         Only for a body that starts at the shell's face: the place (3,) of the mid-surface there,
         and the vector (3,) from this place to the body's front. None for a body that has a position
@@ -92,6 +98,8 @@ class ContactBody:
     max_penetration: float
     size: float
     has_given_stiffness: bool = False
+    front_offset: float = 0.0
+    shells: tuple[str, ...] = ()
     start: Array | None = None
     lift: Array | None = None
 
@@ -204,39 +212,6 @@ def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
     return change * (F[1] + ufl.dot(mixed_derivatives, s) + change / 2 * F[5])
 
 
-def contact_pressure(
-    r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms
-) -> Expr:
-    """Return the contact pressure per undeformed area over E h/R, as a UFL expression.
-
-    It is the norm of the gradient of psi at the expansion point, that is at the state for which P
-    was computed. The other parameters are not used here: densities have them as arguments.
-    """
-    return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
-
-
-def radius_density(front: Expr, axis: Expr) -> Callable[..., Expr]:
-    """Return a density: the contact pressure times the distance from the axis of the approach.
-
-    Its integral over the total force is the mean radius of the contact.
-
-    Parameters
-    ----------
-    front, axis
-        A place (3,) of the axis over R, and its unit vector (3,).
-    """
-
-    def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
-        """Return the pressure times the distance of the deformed place from the axis."""
-        x = r0.r + u.r - front
-        from_axis = x - ufl.dot(x, axis) * axis
-        return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(
-            ufl.dot(from_axis, from_axis)
-        )
-
-    return density
-
-
 def _off_expansion_point(u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
     """Return the offset (3,) of y = u - a d from the expansion point of the polynomial P.
 
@@ -261,12 +236,15 @@ class Region:
     radius, inner, outer
         Mean, least and largest distance of the contact pressure from the axis of the approach; 0
         without contact.
+    pressure
+        Largest contact pressure at the points, over E h/R.
     """
 
     penetration: float
     radius: float
     inner: float
     outer: float
+    pressure: float
 
 
 @dataclass(frozen=True)
@@ -399,12 +377,12 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
     ----------
     h
         Thickness over R.
-    r0, u
-        Placement and displacement over R in one space; on a meridian along e_rho and e_z.
+    domain
+        The surface or the meridian, with the placement.
+    u
+        Displacement over R in the placement's space; on a meridian along e_rho and e_z.
     approach
         The approach over h, as a constant in the forms.
-    degree
-        Degree of the quadrature.
     thickness
         The thickness over h; None where it is h.
     ratio_at_points
@@ -430,8 +408,9 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
     its derivatives by t (points, 5). `_expansion_gap` are the gaps (points,) about which the
     penalty is expanded, if these are not the present ones. Both are empty tuples otherwise.
 
-    The memos are those of the placement r0 (cells, points, 3) at the points, the factor t, the gap
-    with its gradient and Hessian (`_gap_memo`), and the penalty (`_penalty_memo`). Points of all
+    The memos are those of the placement r0 (cells, points, 3) at the points, the areas (cells,
+    points) that they stand for, on a meridian of whole rings, the factor t, the gap with its
+    gradient and Hessian (`_gap_memo`), and the penalty (`_penalty_memo`). Points of all
     cells are also counted in one row: (points,) stands for (cells * points,).
     """
 
@@ -441,10 +420,9 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         self,
         contact: ContactBody,
         h: float,
-        r0: fem.Function,
+        domain: IntegrationDomain,
         u: fem.Function,
         approach: fem.Constant,
-        degree: int,
         thickness: fem.Function | None = None,
         ratio_at_points: ThicknessRatio | None = None,
     ) -> None:
@@ -452,11 +430,21 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
 
         A memo takes a function of its value, and one of the arrays whose change makes it outdated.
         """
-        V = u.function_space
+        V, r0, degree = u.function_space, domain.r0, domain.contact_rule
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, POLYNOMIAL_SIZE)
         self._points, self._degree = self.polynomial.points, degree
         self._placement_memo = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
+        jets_at_points = domain.tables(V, self._points)
+        _, weights = basix.make_quadrature(V.mesh.basix_cell(), degree)
+
+        def areas() -> Array:
+            """Return the undeformed areas (cells, points) that points stand for, over R²."""
+            tangents = jets_at_points(r0.x.array)[1:3]
+            ratio = np.linalg.norm(np.cross(*tangents), axis=-1)
+            return np.asarray(domain.revolution_factor * weights * ratio)
+
+        self._area_memo = Memo(areas, lambda: (r0.x.array,))
         # the deformed over the undeformed thickness at the points; None where it is 1
         ratio_memo = ratio_at_points and ratio_at_points(self._points)
         factor, thicknesses = _thickness_factor(thickness, ratio_memo, self._points)
@@ -721,25 +709,44 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         is_even = pressures.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
         return np.asarray((pressures > 0).all(axis=1) & is_even)
 
+    def _tractions(self) -> Array:
+        """Return the forces per undeformed area on the body (cells, points, 3), over E h/R."""
+        self.polynomial.renew()
+        return self.polynomial.values[..., 4:7]
+
     def _pressures(self) -> Array:
         """Return the contact pressure at the points of local cells (cells, points), over E h/R."""
-        self.polynomial.renew()
-        gradients_of_psi = self.polynomial.values[..., 4:7]
-        return np.asarray(np.linalg.norm(gradients_of_psi, axis=-1))
+        return np.asarray(np.linalg.norm(self._tractions(), axis=-1))
 
-    def region(self, comm: MPI.Comm, radius: float) -> Region:
-        """Return the region where the body touches the shell; collective.
+    def pressed_points(self) -> PressedPoints:
+        pressures, area = self._pressures()[: self._owned], self._area_memo.renew()[: self._owned]
+        places = self._placement_memo.renew() + at_quadrature(self._u, self._points)
+        cell, point = np.nonzero(pressures)
+        return PressedPoints(
+            places[cell, point],
+            pressures[cell, point],
+            area[cell, point],
+            area.sum(axis=1)[cell],
+        )
 
-        Parameters
-        ----------
-        comm
-            Communicator of the mesh.
-        radius
-            Mean radius of the contact over R, which becomes that of the region. The caller
-            integrates it by `radius_density`.
+    def forces_and_moments(self) -> tuple[Array, Array]:
+        """Return the forces on the body at the points of own cells, and their moments.
+
+        Both are (cells, points, 3), over E h R and E h R². Moments are about the body's reference
+        point, where it is at present. On a meridian a force is the sum of the forces at azimuth
+        zero that the ring of a point has.
         """
+        body, own = self.contact, slice(0, self._owned)
+        forces = (self._area_memo.renew()[..., None] * self._tractions())[own]
+        # relative to the body, which is then at approach zero
+        places = (self._placement_memo.renew() + self.place)[own]
+        arms = places - (body.front - body.front_offset * body.direction)
+        return forces, np.asarray(np.cross(arms, forces), np.float64)
+
+    def region(self) -> Region:
+        """Return the region where the body touches the shell; collective."""
         # points of owned cells alone: ghosts belong to other ranks
-        owned = slice(0, self._owned * len(self._points))
+        owned, comm = slice(0, self._owned * len(self._points)), self.comm
         gap = self.gap[owned]
         x, d = (self._placement_memo.renew() + self.place).reshape(-1, 3), self.contact.direction
         _, pressure, _ = self.penalty.derivatives(-gap)
@@ -748,8 +755,12 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         from_front = x[owned] - self.contact.front
         distance_from_axis = np.linalg.norm(from_front - (from_front @ d)[:, None] * d, axis=1)
         from_axis = distance_from_axis[pressure > PRESSURE_THRESHOLD * largest]
+        # the mean distance, weighted with the force
+        force = (self._area_memo.renew() * self._pressures()).ravel()[owned]
+        total, moment = comm.allreduce(np.array([force.sum(), force @ distance_from_axis]))
+        radius = float(moment / total) if total else 0.0
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
         # without contact the least distance is that of no points, infinite
-        return Region(penetration, radius, inner if largest else 0.0, outer)
+        return Region(penetration, radius, inner if largest else 0.0, outer, largest)

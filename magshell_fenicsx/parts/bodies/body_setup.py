@@ -9,7 +9,7 @@ approaches over h, stiffnesses over E h/R^2; D is the bending stiffness.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan2, inf, sqrt
 
 import numpy as np
@@ -44,6 +44,7 @@ def contact_bodies(
     approaches: Mapping[str, str],
     driven_amplitudes: Collection[str],
     reference: ReferenceShell,
+    shells: Collection[str] = (),
 ) -> tuple[ContactBody, ...]:
     """Return the rigid bodies of a case as a model needs them.
 
@@ -57,13 +58,18 @@ def contact_bodies(
         Load parameters that the steps of the case drive.
     reference
         The undeformed shell.
+    shells
+        Names of the shells, where there are several.
 
     Raises
     ------
     CaseError
         If a body penetrates the undeformed shell, or a body that moves overlaps another.
     """
-    contacts = [_contact(name, body, approaches[name], reference) for name, body in bodies.items()]
+    contacts = [
+        replace(_contact(name, body, approaches[name], reference), shells=(*shells,))
+        for name, body in bodies.items()
+    ]
     for i, body in enumerate(contacts):
         for other in contacts[i + 1 :]:
             # bodies that stay may overlap
@@ -122,6 +128,7 @@ def _contact(
         max_penetration=section.penetration,
         size=body_radius,
         has_given_stiffness=section.stiffness is not None,
+        front_offset=section.front_offset / placed_body.R,
         start=Q @ start if starts_at_shell else None,
         lift=placed_body.front - Q @ start if starts_at_shell else None,
     )

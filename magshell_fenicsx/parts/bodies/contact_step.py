@@ -25,7 +25,14 @@ from magshell_fenicsx.parts.step_course import (
     Target,
     Until,
 )
-from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
+from magshell_fenicsx.quantities.quantity import (
+    CONTACT_PRESSURE,
+    PLACE,
+    POINT_FORCE,
+    THICKNESS,
+    Amplitude,
+    Quantity,
+)
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.point import StepOptions
@@ -206,6 +213,16 @@ class BodiesObservables(Observables):
             "error",
             each=True,
         ),
+        Quantity(
+            "contact_pressure_max",
+            "largest contact pressure",
+            "At the points of the quadrature; where the contact is narrower than a cell, as at an "
+            "edge of the body, it depends on mesh and penalty.",
+            "load",
+            "p R/(Eh)",
+            (CONTACT_PRESSURE,),
+            each=True,
+        ),
     )
     curve_amplitudes = (
         Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),
@@ -249,7 +266,8 @@ class BodiesObservables(Observables):
         """Return the values of all bodies' columns at a state, in the units of the view.
 
         The mapping is column -> number. The columns of each body are its approach, the force on it,
-        the penetration, three radii of the contact, and the stiffness of the penalty. Collective.
+        the penetration, three radii of the contact, the stiffness of the penalty, and the largest
+        pressure. Collective.
         """
         model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:  # by the name of the body's approach
@@ -258,10 +276,12 @@ class BodiesObservables(Observables):
             region, potential = model.region(state, name), view.potential(state, name)
             force = -potential / self._unit(view)
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
-            body_contact, _ = model.contacts[name]
-            stiffness = float(body_contact.stiffness.value)
+            stiffness = float(model.contacts[name].stiffness.value)
             # in the order of `contact_columns`
-            numbers = state.mu[name], force, region.penetration / h, *radii, stiffness
+            numbers = (
+                *(state.mu[name], force, region.penetration / h),
+                *(*radii, stiffness, region.pressure),
+            )
             values |= dict(zip(contact_columns(name), numbers, strict=True))
         return values
 

@@ -57,7 +57,11 @@ from magshell_fenicsx.parts.contact.time_averaging import (
     at_each_sample,
     samples_of_step,
 )
-from magshell_fenicsx.parts.penalty_contact import PASS_THROUGH_DISTANCE, PenaltyContact
+from magshell_fenicsx.parts.penalty_contact import (
+    PASS_THROUGH_DISTANCE,
+    PenaltyContact,
+    PressedPoints,
+)
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -494,6 +498,23 @@ class PairContact(PenaltyContact[Array, FrozenContact[Places]], Generic[Places])
     def evenly_pressed(self) -> Flags:
         _, _, is_full = self.cell_pressures_and_gaps()
         return is_full
+
+    def pressed_points(self) -> PressedPoints:
+        active = self._active_set()
+        points, (first_cell, count) = active.points, self._geometry.local_cells
+        _, pressures, _ = active.penalties
+        is_pressed = pressures > 0
+        joined_points = active.places.point[active.joined_places.first][is_pressed]
+        cell = points.cell[joined_points]
+        nodal = (self._r0 + self._displacement())[self._nodes[cell]]
+        places = np.einsum("nf,nfi->ni", points.shape[joined_points], nodal)
+        if places.shape[1] == 2:  # of a meridian
+            places = np.insert(places, 1, 0.0, axis=1)
+        area_of_cells = np.bincount(points.cell - first_cell, points.weight, count)
+        cell_area = np.asarray(area_of_cells[cell - first_cell], np.float64)
+        # half, since the points of both members have the same force
+        area = active.area[is_pressed] / 2
+        return PressedPoints(places, pressures[is_pressed], area, cell_area)
 
     def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
         """Return pressure, gap and full contact of each local cell; collective.

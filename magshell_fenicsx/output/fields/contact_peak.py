@@ -1,0 +1,104 @@
+"""What the quadrature points of a contact say beside the pressure of cells: the largest pressure,
+and the force per length of a contact that is narrower than a cell.
+
+Lengths are over R, pressures over E h/R, forces over E h R. On a meridian points are (rho, 0, z),
+and each stands for a ring.
+"""
+
+from dataclasses import dataclass
+from math import nan
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.penalty_contact import PressedPoints
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shells.meridian import MeridianModel
+    from magshell_fenicsx.shells.shell import ShellModel
+
+Array = NDArray[np.float64]
+REACH_ALONG_LINE = 2.3  # square roots of a cell's area: some one and a half sides
+MAX_WIDTH_OF_LINE = 0.5  # over its length
+MOST_POINTS = 200  # around which the force per length is computed
+
+
+@dataclass(frozen=True)
+class ContactPeak:
+    """Numbers of a contact at its quadrature points.
+
+    Attributes
+    ----------
+    pressure
+        Largest pressure, over E h/R.
+    line_force
+        Force per length over E h of a contact along a line; nan where it is in a spot.
+    force
+        Sum of all normal forces, of the whole shell, over E h R.
+    """
+
+    pressure: float
+    line_force: float
+    force: float
+
+
+def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPeak | None:
+    """Return the numbers of all contacts of a model at a state; None without touch. Collective."""
+    contacts, comm = model.all_contacts, model.system.comm
+    if not contacts:
+        return None
+    evaluation = model.system.at_state(state)
+    of_contacts = evaluation.evaluate(lambda: [c.pressed_points() for c in contacts])
+    points = PressedPoints.gathered(of_contacts, comm)
+    if not len(points.pressure):
+        return None
+    forces = points.pressure * points.area
+    line_force = _along_meridian if len(model.axes) == 2 else _along_surface
+    return ContactPeak(
+        float(points.pressure.max()),
+        line_force(points, forces),
+        float(model.multiplicity * forces.sum()),
+    )
+
+
+def _along_meridian(points: PressedPoints, forces: Array) -> float:
+    """Return the largest force per length of rings, each within the length of a cell."""
+    rho = points.places[:, 0]
+    around = 2 * np.pi * np.maximum(rho, np.finfo(float).tiny)
+    size = points.cell_area / around
+    neighbours = cKDTree(points.places).query_ball_point(points.places, size)
+    sums = np.array([(forces[near] / around[near]).sum() for near in neighbours])
+    largest = int(sums.argmax())
+    is_spot = rho[largest] < 2 * size[largest]  # about the axis
+    return nan if is_spot else float(sums[largest])
+
+
+def _along_surface(points: PressedPoints, forces: Array) -> float:
+    """Return the median of the forces per length around points; nan if most are in spots."""
+    count = len(forces)
+    chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
+    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[chosen])
+    neighbours = cKDTree(points.places).query_ball_point(points.places[chosen], reach)
+    of_points = np.array([_per_length(points.places[near], forces[near]) for near in neighbours])
+    is_line, weights = np.isfinite(of_points), forces[chosen]
+    if weights[is_line].sum() < weights.sum() / 2:
+        return nan
+    order = np.argsort(of_points[is_line])
+    weights = weights[is_line][order]
+    middle = np.searchsorted(np.cumsum(weights), weights.sum() / 2)
+    return float(of_points[is_line][order][middle])
+
+
+def _per_length(places: Array, forces: Array) -> float:
+    """Return the sum of forces (n,) at places (n, 3) over the length of their line; nan of a spot.
+
+    An even force on a straight line of the length L has the variance L²/12 along it.
+    """
+    from_middle = places - forces @ places / forces.sum()
+    covariance = (forces[:, None] * from_middle).T @ from_middle / forces.sum()
+    *_, across, along = np.linalg.eigvalsh(covariance)
+    is_spot = across > MAX_WIDTH_OF_LINE**2 * along
+    return nan if is_spot or not along else float(forces.sum() / np.sqrt(12 * along))
