@@ -165,10 +165,8 @@ def trace(  # noqa: PLR0913
         If the path is lost, or there is no equilibrium to start from.
     """
     if isinstance(scene, Record):
-        record = scene
-        if record.scene is None:
-            raise ValueError("trace: this record comes from another process: give a model as well")
-        scene, start = record.scene, start or record
+        start = start or scene
+        scene = scene.known_scene("trace", "give a model as well")
     scene.read_functions()
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)
@@ -207,7 +205,7 @@ def trace(  # noqa: PLR0913
     records_of_path = follow_path(load_stage(scene), path, first_point, goal)
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _with_reached(
-        (replace(record, shown=scene.displacement, scene=scene) for record in records),
+        (record.of_scene(scene) for record in records),
         name,
         targets,
     )
