@@ -349,6 +349,7 @@ def gradient(
     FoldLost
         If Newton's method for the fold fails.
     """
+    Scene.refuse_other_arguments("gradient", scene, [record])
     if by is None:
         if of != "instability":
             raise CaseError(
