@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.model import Mode, Model
     from magshell_fenicsx.models.shell import kinematics
-    from magshell_fenicsx.models.shell.kinematics import Jet
+    from magshell_fenicsx.models.shell.kinematics import Jet as Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
     from magshell_fenicsx.public import Scene as Scene
     from magshell_fenicsx.public import boundary, ensemble, follow, identify, run, sweep
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.runs.summary import Result
     from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
-    from magshell_fenicsx.simulate.search import solutions
-    from magshell_fenicsx.simulate.sensitivity import sensitivities
-    from magshell_fenicsx.simulate.steps import fold_at
+    from magshell_fenicsx.simulate.search import solutions as solutions
+    from magshell_fenicsx.simulate.sensitivity import sensitivities as sensitivities
+    from magshell_fenicsx.simulate.steps import fold_at as fold_at
     from magshell_fenicsx.simulate.trace import trace
 
 __all__ = [
@@ -61,7 +61,6 @@ __all__ = [
     "Free",
     "Held",
     "Hinged",
-    "Jet",
     "MeshError",
     "Mode",
     "Model",
@@ -81,7 +80,6 @@ __all__ = [
     "columns",
     "curve",
     "ensemble",
-    "fold_at",
     "follow",
     "gradient",
     "identify",
@@ -90,8 +88,6 @@ __all__ = [
     "picture",
     "polydata",
     "run",
-    "sensitivities",
-    "solutions",
     "surface",
     "sweep",
     "trace",

@@ -182,9 +182,15 @@ class Model(Scene):
             If it is of another model.
         """
         if isinstance(state, PETSc.Vec):
-            state = self._supported(State(np.array(state.array_r), self._state.mu))
+            u = self._own_unknowns("put", state.array_r)
+            state = self._supported(State(u, self._state.mu))
         if isinstance(state, Record):
             state = state.point.state
+        if not isinstance(state, State):
+            raise ValueError(
+                f"put: a {type(state).__name__}: give a state, a record, or a PETSc vector such as "
+                "model.unknowns()"
+            )
         self.refuse_foreign(state)
         self._move_to(state)
 
@@ -259,7 +265,7 @@ class Model(Scene):
         if not (self.allows_rigid_motion or self.free_in_time):
             pivots = self.newton.factor_at(state).negative_pivots
         point = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots)
-        return Record("target", "", point, shown=self.displacement, scene=self)
+        return Record("target", "", point).of_scene(self)
 
     def modes(self, count: int = 6) -> list[Mode]:
         """Return the natural modes of lowest frequency at the state, ascending.
@@ -268,9 +274,13 @@ class Model(Scene):
 
         Raises
         ------
+        ValueError
+            If `count` is no number from 1 on.
         ModesNotFound
             If the iteration for the eigenvalues does not find them.
         """
+        if not isinstance(count, int | np.integer) or count < 1:
+            raise ValueError(f"modes: {count!r}: give a number from 1 on")
         self.read_functions()
         space = mode_space(self.model)  # of a sector another model
         shell_modes = ShellModes(space.model).vibrations(
@@ -285,9 +295,38 @@ class Model(Scene):
         return [Mode(mode.eigenvalue, mode.label, function_of(mode)) for mode in shell_modes]
 
     def function(self, vector: PETSc.Vec | Vector) -> fem.Function:
-        """Return a vector of the model's unknowns as a function, such as an eigenvector."""
+        """Return a vector of the model's unknowns as a function, such as an eigenvector.
+
+        Raises
+        ------
+        ValueError
+            If the vector is of another model.
+        """
         local = vector.array_r if isinstance(vector, PETSc.Vec) else vector
-        return self.on_given_mesh(self.model.system.with_ghosts(np.array(local)))
+        return self.on_given_mesh(
+            self.model.system.with_ghosts(self._own_unknowns("function", local))
+        )
+
+    def _own_unknowns(self, name: str, values: Vector) -> Vector:
+        """Return a copy of this rank's values of unknowns.
+
+        Parameters
+        ----------
+        name
+            The method that got them, for a message.
+
+        Raises
+        ------
+        ValueError
+            If they are not as many as this rank owns.
+        """
+        size = self.model.system.size
+        if np.shape(values) != (size,):
+            raise ValueError(
+                f"{name}: a vector of {np.size(values)} unknowns on this rank, where the model has "
+                f"{size}: take one like model.unknowns()"
+            )
+        return np.array(values)
 
     def _vector(self, values: Vector) -> PETSc.Vec:
         """Return values of this rank's unknowns as a PETSc vector."""

@@ -15,6 +15,7 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.case_variants import open_case, with_same_files
 from magshell_fenicsx.case.open_problem import ProblemSource, problem_of, processes
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.model import Model
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.problem.problem import Problem
@@ -100,9 +101,25 @@ def follow(
     return follow_scene(scene, search=search, remark=remark)
 
 
+def _ranks(executor: Executor | None) -> MPI.Intracomm:
+    """Return the ranks that compute a study: this process alone where it has an executor.
+
+    Raises
+    ------
+    CaseError
+        If the executor is none.
+    """
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise CaseError(
+            f"executor: {executor!r}: is no executor: give one of concurrent.futures, such as "
+            "ProcessPoolExecutor(4)"
+        )
+    return MPI.COMM_SELF if executor else MPI.COMM_WORLD
+
+
 def sweep(
     file: Path | str,
-    over: Sequence[str],
+    over: str | Sequence[str],
     settings: Sequence[str] = (),
     out: Path | str = "results/sweep",
     say: Say = lambda line: None,
@@ -116,7 +133,7 @@ def sweep(
     Parameters
     ----------
     over
-        One axis each: "KEY=START:STOP:COUNT" or "KEY=VALUE,VALUE"; keys tied with `+`.
+        One axis, or several: "KEY=START:STOP:COUNT" or "KEY=VALUE,VALUE"; keys tied with `+`.
     settings
         Texts "KEY=VALUE" that replace keys of the case.
     out
@@ -133,10 +150,10 @@ def sweep(
 
     return sweep_case(
         file,
-        over,
+        [over] if isinstance(over, str) else over,
         settings,
         out,
-        MPI.COMM_SELF if executor else MPI.COMM_WORLD,
+        _ranks(executor),
         say,
         make_case=Case.from_source,
         result=result,
@@ -181,7 +198,7 @@ def ensemble(
         make_case=Case.from_source,
         result=result,
         out=out,
-        comm=MPI.COMM_SELF if executor else MPI.COMM_WORLD,
+        comm=_ranks(executor),
         say=say,
         executor=executor,
     )

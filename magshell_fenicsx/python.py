@@ -14,7 +14,8 @@ from dataclasses import replace
 from math import atan2, degrees, hypot
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, Literal, TypeAlias, Unpack, get_args
+from types import UnionType
+from typing import Any, Literal, TypeAlias, Union, Unpack, get_args, get_origin, overload
 
 import numpy as np
 import ufl
@@ -33,12 +34,23 @@ from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
-from magshell_fenicsx.python_keys import FieldKeys, ForceKeys, PressureKeys
+from magshell_fenicsx.python_keys import (
+    FieldKeys,
+    ForceKeys,
+    FoundationKeys,
+    MeshKeys,
+    NaturalKeys,
+    PressureKeys,
+    SectionName,
+    StepKeys,
+    StepKind,
+)
 
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
 MESH = "the mesh"  # in messages, in place of a mesh file
+UNIONS = (Union, UnionType)
 # a mesh so many times as long as the radius, or such a part of it, is not in metres
 MAX_EXTENT_OVER_RADIUS = 50.0
 # extents of a mesh in metres that is not said to be in metres
@@ -118,6 +130,13 @@ class Shell:
     ) -> None:
         self.user_mesh: UserMesh | None = None
         self.name = name
+        _refuse_nameless("shell.edges", edges, 'edges={"rim": 2}')
+        _refuse_nameless("shell.patches", patches, 'patches={"magnet": 1}')
+        if isinstance(keys.get("thickness"), fem.Function | fem.Constant):
+            raise CaseError(
+                f"{NAME}: shell.thickness: is a length alone: give a number or text, and "
+                "thickness_factor, a function or a constant that multiplies it"
+            )
         self._member_keys = {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
@@ -269,13 +288,20 @@ class Section(ProblemPart):
         If a case has no such section, or the section has no such key.
     """
 
+    @overload
+    def __init__(self, key: Literal["foundation"], **keys: Unpack[FoundationKeys]) -> None: ...
+    @overload
+    def __init__(self, key: Literal["natural"], **keys: Unpack[NaturalKeys]) -> None: ...
+    @overload
+    def __init__(self, key: Literal["mesh"], **keys: Unpack[MeshKeys]) -> None: ...
+    @overload
+    def __init__(self, key: SectionName, **keys: Any) -> None: ...
     def __init__(self, key: str, **keys: Any) -> None:
         if key not in Case.model_fields:
             raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
         annotation = Case.model_fields[key].annotation
-        types = [
-            member for member in (annotation, *get_args(annotation)) if isinstance(member, type)
-        ]
+        members = get_args(annotation) if get_origin(annotation) in UNIONS else (annotation,)
+        types = [member for member in members if isinstance(member, type)]
         sections = [member for member in types if issubclass(member, BaseModel)]
         # lists, and mappings of names to sections, have no keys that could be checked here
         if len(sections) == 1:
@@ -301,16 +327,16 @@ class Step(ProblemPart):
         If a case has no such kind, or the step has no such key.
     """
 
-    def __init__(self, kind: str, **keys: Any) -> None:
-        kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
-        if kind not in STEPS:
+    def __init__(self, kind: StepKind, **keys: Unpack[StepKeys]) -> None:
+        known_kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
+        if known_kind not in STEPS:
             raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
-        refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
-        data = {"kind": kind, **keys}
+        refuse_unknown(keys, STEPS[known_kind], f"{NAME}: loading")
+        data = {"kind": known_kind, **keys}
         super().__init__(
             "loading",
             lambda shell: shell.plain_value(data, "loading"),
-            _call_text("Step", (kind,), keys),
+            _call_text("Step", (known_kind,), keys),
         )
 
 
@@ -445,6 +471,18 @@ class Field(ProblemPart):
 
         given = dict(keys) if lambda_m is None else {"lambda_m": lambda_m, **keys}
         super().__init__("magnetic", magnetic_keys, _call_text("Field", (remanent, applied), given))
+
+
+def _refuse_nameless(key: str, value: Any, example: str) -> None:
+    """Check that a value has names; None is not given.
+
+    Raises
+    ------
+    CaseError
+        If it is no mapping; the message has the example.
+    """
+    if value is not None and not isinstance(value, Mapping):
+        raise CaseError(f"{NAME}: {key}: {value!r}: give names with their values: {example}")
 
 
 def _refuse_mesh_keys(geometry: str, **mesh_keys: Any) -> None:
@@ -613,6 +651,7 @@ class Problem(problem.Problem, metaclass=_ProblemType):
         symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
         **sections: Any,
     ) -> problem.Problem:
+        _refuse_nameless("points", points, 'points={"tip": [1, 0, 0]}')
         member_shells = list(shell) if isinstance(shell, list | tuple) else []
         if member_shells:
             # any of them turns values into plain ones: none has a mesh, and so no functions

@@ -44,9 +44,9 @@ ms.curve(scene, records)
 # The fold to 1e-9 h, and what the knockdown factor depends on.
 
 # %%
-fold = ms.fold_at(scene, records[-1])
+fold = records[-1].fold()
 knockdown = fold.value
-sensitivities = ms.sensitivities(scene, fold)
+sensitivities = ms.gradient(scene, records[-1], of="instability")
 print(f"k_d = {knockdown:.9f}")
 for name, value in sensitivities.items():
     print(f"d k_d / d {name} = {value:.6g}")

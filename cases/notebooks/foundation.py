@@ -19,7 +19,7 @@ import ufl
 import magshell_fenicsx as ms
 
 
-def winkler(r0: ms.Jet, u: ms.Jet) -> ufl.core.expr.Expr:
+def winkler(r0: ms.kinematics.Jet, u: ms.kinematics.Jet) -> ufl.core.expr.Expr:
     w = -ufl.dot(u.r, ms.kinematics.normal(r0))
     return w**2 / 2
 
@@ -43,8 +43,8 @@ def buckling(stiffness: float) -> list[ms.Record]:
 
 K, STEP = 0.02, 0.002
 records = buckling(K)
-fold = ms.fold_at(scene, records[-1])
-slope = ms.sensitivities(scene, fold)["foundation"]
+fold = records[-1].fold()
+slope = ms.gradient(scene, records[-1], of="instability", by="foundation")["foundation"]
 print(f"k_d = {fold.value:.9f}, d k_d / d k = {slope:.6f}")
 
 # %% [markdown]
@@ -52,8 +52,7 @@ print(f"k_d = {fold.value:.9f}, d k_d / d k = {slope:.6f}")
 
 # %%
 folds = {
-    change: ms.fold_at(scene, buckling(K + change)[-1]).value
-    for change in (-2 * STEP, -STEP, STEP, 2 * STEP)
+    change: buckling(K + change)[-1].fold().value for change in (-2 * STEP, -STEP, STEP, 2 * STEP)
 }
 difference = (8 * (folds[STEP] - folds[-STEP]) - (folds[2 * STEP] - folds[-2 * STEP])) / (12 * STEP)
 print(f"by finite differences {difference:.6f}")
@@ -66,7 +65,7 @@ P = 0.345
 rest = scene.unloaded()
 *_, held = ms.trace(scene, "pressure", rest.with_(rest.u, "foundation", K), targets=[P])
 softer = list(ms.trace(scene, "foundation", held, first=-K / 10))
-critical = ms.fold_at(scene, softer[-1]).value
+critical = softer[-1].fold().value
 print(f"at p/p_c = {P} the shell buckles at k = {critical:.9f}")
 
 # %%

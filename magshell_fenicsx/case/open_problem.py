@@ -45,7 +45,15 @@ def problem_of(
 
 
 def processes(source: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
-    """Return the processes of a run: by default those of a problem's mesh, or all."""
+    """Return the processes of a run: by default those of a problem's mesh, or all.
+
+    Raises
+    ------
+    CaseError
+        If `comm` is no communicator.
+    """
+    if comm is not None and not isinstance(comm, MPI.Comm):
+        raise CaseError(f"comm: {comm!r}: give a communicator, such as MPI.COMM_WORLD of mpi4py")
     mesh_file = source.mesh_file if isinstance(source, Problem) else None
     if comm:
         return comm

@@ -65,7 +65,7 @@ from magshell_fenicsx.continuation.system import (
 )
 
 Quantity = Literal["load", "conjugate"]
-Control = Quantity | Literal["arc"]
+Control = Literal["load", "conjugate", "arc"]
 StepEnd = Callable[[float, Sequence[Point]], float]  # (s, predictors) -> s where the step ends
 # number of hard solves after which the tangent takes the stress extrapolated from the last point,
 # which costs a tenth more time

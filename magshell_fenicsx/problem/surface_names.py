@@ -70,8 +70,13 @@ def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
     # parameters may be shared by terms: a set has each once
     names += {p.name for term in terms for p in term.free_parameters}
     for name in names:
-        if name in RESERVED_NAMES or names.count(name) > 1:
-            raise CaseError(f"terms: {name}: something else has this name already")
+        if name in RESERVED_NAMES:
+            owner = "an amplitude or a column of the package"
+        elif names.count(name) > 1:
+            owner = "another energy, integral or parameter of these terms"
+        else:
+            continue
+        raise CaseError(f"terms: {name}: something else has this name already: {owner}")
 
 
 def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:

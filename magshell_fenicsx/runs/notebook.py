@@ -48,6 +48,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     record
         A point of a history of the scene.
     """
+    Scene.refuse_other_arguments("surface", scene, [record])
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
     # the modelled part, then the whole shell, in the frame of the case
@@ -167,6 +168,7 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
         If nothing has varied, or the scene has no such amplitude.
     """
     records = list(records)
+    Scene.refuse_other_arguments("curve", scene, records)
     name = amplitude or (records[-1].amplitude if records else "")
     if not name:
         raise ValueError(

@@ -254,11 +254,18 @@ def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
     return columns
 
 
-def columns(scene: Scene, records: Iterable[Record]) -> Table:
+def columns(scene: Scene, records: Iterable[Record] | Record) -> Table:
     """Return the columns of path.csv except wall_s, each an array (records,). Collective.
 
     `columns(...).to_pandas()` is a frame of pandas.
+
+    Raises
+    ------
+    ValueError
+        If the arguments are in another order.
     """
+    records = list(records) if isinstance(records, Iterable) else [records]
+    Scene.refuse_other_arguments("columns", scene, records)
     by_name = table(rows(scene, records), scene.extra_columns)
     del by_name["wall_s"]
     return by_name

@@ -603,7 +603,7 @@ def follow_branch(
     Stopped
         If the branch is lost.
     """
-    start = _with_fit_contact(stage, path, start)
+    start = with_fit_contact(stage, path, start)
     walk, monitor = checked_run(stage, path, start, goal), stage.scene.stability_monitor
     stop_reason = ""
     monitor.begin(path, start, stage.leave, evaluate=True)
@@ -632,7 +632,7 @@ def follow_branch(
     return walk.points[-1].state
 
 
-def _with_fit_contact(stage: Stage, path: Path, start: Point) -> Point:
+def with_fit_contact(stage: Stage, path: Path, start: Point) -> Point:
     """Return the first point of a branch, corrected again with contact that fits it; collective.
 
     Penalties become stiffer, and shells are cut anew, until both fit the displacement of the point.

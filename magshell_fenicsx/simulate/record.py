@@ -5,16 +5,16 @@ An amplitude is a load parameter, by name in `State.mu`. A model with symmetry e
 break it.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import State
 
 if TYPE_CHECKING:
     from dolfinx import fem
 
+    from magshell_fenicsx.continuation.fold import Fold
     from magshell_fenicsx.simulate.scene import Scene
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
@@ -58,8 +58,6 @@ class Record:
         Columns of a step in time: time, kinetic, dissipated and work, since its begin.
     reached
         False at the end of a `trace` that has not come to its last target.
-    shown
-        Function that makes `u` of a state.
     scene
         Scene of the point: another than that of a run's begin where a mode has led out of its
         model.
@@ -76,13 +74,12 @@ class Record:
     step: int = 0
     clock: Mapping[str, float] = field(default_factory=dict)
     reached: bool = True
-    shown: "Callable[[State], fem.Function] | None" = field(default=None, compare=False, repr=False)
     scene: "Scene | None" = field(default=None, compare=False, repr=False)
     said: str = ""
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: a scene belongs to its process."""
-        return vars(self) | {"shown": None, "scene": None}
+        return vars(self) | {"scene": None}
 
     def __repr__(self) -> str:
         """Return the record in a line: its label, amplitudes and stability."""
@@ -92,6 +89,101 @@ class Record:
         mode = f" ({self.mode})" if self.mode else ""
         unstable = self.point.negative_pivots + self.excluded_pivots
         return f"Record {self.label}{mode}: {amplitudes or 'no load'}; {unstable} unstable"
+
+    def of_scene(self, scene: "Scene", step: int = 0) -> "Record":
+        """Return the record as a point of a scene, found by a step of its programme or by none."""
+        return replace(self, step=step, scene=scene)
+
+    def known_scene(self, name: str, advice: str = "") -> "Scene":
+        """Return the scene of the point.
+
+        Parameters
+        ----------
+        name
+            What asks for it, for a message.
+        advice
+            What to write for a record without a scene; by default to give it one.
+
+        Raises
+        ------
+        ValueError
+            If the record was pickled.
+        """
+        if self.scene is None:
+            advice = advice or f"record.of_scene(model).{name}()"
+            raise ValueError(f"{name}: this record comes from another process: {advice}")
+        return self.scene
+
+    def fold(self) -> "Fold":
+        """Return the fold at a record with the label "fold", with its null vector; collective.
+
+        Its amplitude, `value`, has an error of some 1e-9; that of the record is as it was located.
+
+        Raises
+        ------
+        ValueError
+            If the record has another label, or was pickled.
+        FoldLost
+            If Newton's method for the fold fails.
+        """
+        from magshell_fenicsx.simulate.steps import fold_at
+
+        return fold_at(self.known_scene("fold"), self)
+
+    def branches(self) -> list["Record"]:
+        """Return the first points of the branches at a bifurcation; collective.
+
+        `ms.trace(record, name, first=...)` follows one. A mode of the model itself has two, along
+        the mode and against it. A mode that the model excludes has one, in the smallest model that
+        has the mode (`record.scene`): the other is the same shape, turned or mirrored.
+
+        Raises
+        ------
+        ValueError
+            If this record is no bifurcation, or was pickled.
+        Stopped
+            If no branch is found.
+        """
+        from magshell_fenicsx.simulate.steps import first_records_of_branches
+
+        return first_records_of_branches(self)
+
+    def solutions(
+        self,
+        *,
+        most: int = 3,
+        guesses: int = 12,
+        stable: bool = False,
+        seconds: float | None = None,
+    ) -> "Iterator[Record]":
+        """Find further equilibria at the same amplitudes, such as snapped shapes; collective.
+
+        All amplitudes are loads. Each equilibrium is confirmed by Newton's method, and differs from
+        all others. There may be more.
+
+        Parameters
+        ----------
+        most
+            Largest number of solutions.
+        guesses
+            Largest number of guesses that are tried.
+        stable
+            Whether each guess goes down in energy until it rests at a stable solution; only stable
+            ones count then.
+        seconds
+            Time after which the search ends; None: without a limit.
+
+        Raises
+        ------
+        ValueError
+            If the record was pickled.
+        Stopped
+            If the record is no equilibrium.
+        """
+        from magshell_fenicsx.simulate.search import solutions
+
+        scene = self.known_scene("solutions")
+        return solutions(scene, self, most=most, guesses=guesses, stable=stable, seconds=seconds)
 
     @property
     def u(self) -> "fem.Function":
@@ -105,11 +197,8 @@ class Record:
         ValueError
             If the record was pickled.
         """
-        if self.shown is None:
-            raise ValueError(
-                "u: this record comes from another process: model.put(record), then model.u"
-            )
-        return self.shown(self.point.state)
+        scene = self.known_scene("u", "model.put(record), then model.u")
+        return scene.displacement(self.point.state)
 
 
 @dataclass

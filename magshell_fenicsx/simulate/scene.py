@@ -17,7 +17,7 @@ Words and symbols:
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 from warnings import warn
@@ -474,6 +474,24 @@ class Scene:
                 f"{place}: {name}: the scene has no such amplitude, only "
                 f"{', '.join(names) or 'none'}"
             )
+
+    @staticmethod
+    def refuse_other_arguments(name: str, scene: object, records: Sequence[object]) -> None:
+        """Check that a function of a model and of records gets them in this order.
+
+        Parameters
+        ----------
+        name
+            Name of the function, for the message.
+
+        Raises
+        ------
+        ValueError
+            If `scene` is no scene, or one of the others no record.
+        """
+        if isinstance(scene, Scene) and all(isinstance(record, Record) for record in records):
+            return
+        raise ValueError(f"{name}: give the model first, then what follow or trace yield")
 
     def refuse_foreign(self, state: State, *, allows_more: bool = False) -> None:
         """Check that a state may be one of this scene, by its numbers and names.

@@ -225,25 +225,12 @@ def solutions(
     stable: bool = False,
     seconds: float | None = None,
 ) -> Iterator[Record]:
-    """Find further equilibria at the amplitudes of a known one, such as snapped shapes.
-
-    All amplitudes are loads. Every one is confirmed by Newton's method, and differs from all
-    others. There may be more.
-
-    Parameters
-    ----------
-    most
-        Largest number of solutions.
-    guesses
-        Largest number of guesses that are tried.
-    stable
-        Whether each guess goes down in energy until it rests at a stable solution; only stable ones
-        count then.
-    seconds
-        Time after which the search ends; None: without a limit.
+    """Find further equilibria at the amplitudes of a record or a state; see `Record.solutions`.
 
     Raises
     ------
+    ValueError
+        If the state is of another scene.
     Stopped
         If the known state is no equilibrium.
     """
@@ -260,7 +247,8 @@ def solutions(
             f"there is no equilibrium to start from near the given state: {outcome.reason}"
         )
     search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
-    yield from _solutions(load_stage(scene), name, outcome.state, search)
+    for record in _solutions(load_stage(scene), name, outcome.state, search):
+        yield record.of_scene(scene)
 
 
 def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> Iterator[Record]:

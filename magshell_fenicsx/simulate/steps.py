@@ -24,6 +24,7 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.fold import Fold, FoldGuess, find_fold
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
+from magshell_fenicsx.continuation.stability_monitor import unstable_count
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.bodies.contact_step import contact_step_options as along_contact
 from magshell_fenicsx.parts.motion.motion_step import TimeSection
@@ -38,12 +39,14 @@ from magshell_fenicsx.simulate.path_records import (
     RecordStream,
     follow_path,
     off_path,
+    with_fit_contact,
 )
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, load_stage, make_stage
 from magshell_fenicsx.simulate.symmetry_switch import (
     SymmetrySwitch,
+    amount_of,
     follow_switched_branch,
     switch_symmetry,
 )
@@ -312,6 +315,39 @@ def fold_at(scene: Scene, record: Record) -> Fold:
     scene.refuse_foreign(record.point.state)
     stage = stage_of_record(scene, record)
     return find_fold(stage.newton, FoldGuess(stage.enter(record.point.state)), record.amplitude)
+
+
+def first_records_of_branches(bifurcation: Record) -> list[Record]:
+    """Return the first records of the branches at a bifurcation, for `Record.branches`; collective.
+
+    A mode that the model excludes has one: the other direction is the same shape, turned or
+    mirrored.
+
+    Raises
+    ------
+    ValueError
+        If the record is no bifurcation, or was pickled.
+    Stopped
+        If no branch is found.
+    """
+    if bifurcation.label != "bifurcation":
+        raise ValueError(
+            f"branches: this record is no bifurcation, but a {bifurcation.label}: "
+            "ms.trace(..., until='bifurcation') ends at one"
+        )
+    scene, name = bifurcation.known_scene("branches"), bifurcation.amplitude
+    state, mode = bifurcation.point.state, bifurcation.mode
+    scale = abs(amount_of(name, state)) or 1.0
+    switch = switch_symmetry(stage_of_record(scene, bifurcation), bifurcation, scale)
+    starts = switch.starts_of_branch(mode)
+    new_scene, records = switch.scene, list[Record]()
+    for number, start in enumerate(starts if mode in OWN_MODES else starts[:1], 1):
+        point = switch.stage.point(with_fit_contact(switch.stage, switch.path, start))
+        point = replace(point, state=new_scene.model.system.advance(point.state, state.mu))
+        unstable = unstable_count(new_scene.model.symmetry_breaking_modes, point.state)
+        record = Record("step", name, point, branch=number, excluded_pivots=unstable)
+        records.append(record.of_scene(new_scene, bifurcation.step))
+    return records
 
 
 def held_conjugates_of_step(

@@ -113,6 +113,33 @@ class SymmetrySwitch:
             said=self.said,
         )
 
+    def starts_of_branch(self, mode: str) -> list[Point]:
+        """Return the first points of the branch in its two directions; collective.
+
+        They are points of the step's system. That along the mode comes first.
+
+        Parameters
+        ----------
+        mode
+            Name of the mode, for a message.
+
+        Raises
+        ------
+        Stopped
+            If the branch is not found.
+        """
+        # `passes` refuses a start to which a shell would pass through another one
+        crossing = switch_branch(self.path, self.point, partial(passes, self.stage))
+        if crossing is None:
+            raise Stopped(f"the branch at the bifurcation ({mode}) is not found")
+        comm, u, phi = self.scene.model.system.comm, self.point.state.u, self.point.du
+
+        def component_along_mode(start: Point) -> float:
+            """Return how far a point is along the mode."""
+            return dot(comm, start.state.u - u, phi)
+
+        return sorted(crossing.starts, key=component_along_mode, reverse=True)
+
 
 def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> SymmetrySwitch:
     """Return the bifurcation of a record in the smallest model that has its mode; collective.
@@ -254,14 +281,8 @@ def follow_switched_branch(
     """
     switch = switch_symmetry(stage, bifurcation, scale)
     yield switch.record(number)
-    new_stage, at_switch = switch.stage, switch.point
-    # `passes` refuses a start to which a shell would pass through another one
-    crossing = switch_branch(switch.path, at_switch, partial(passes, new_stage))
-    if crossing is None:
-        raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
-    system, u, phi = switch.scene.model.system, at_switch.state.u, at_switch.du
-    # of the first points of the branch, in its two directions, that along the mode
-    start = max(crossing.starts, key=lambda point: dot(system.comm, point.state.u - u, phi))
+    new_stage, at_switch, system = switch.stage, switch.point, switch.scene.model.system
+    start, _ = switch.starts_of_branch(bifurcation.mode)
     records = RecordStream(follow_branch(new_stage, switch.path, start, goal, number))
     earlier_mu = at_switch.state.mu
     for record in records:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from numbers import Real
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -159,16 +159,20 @@ def trace(  # noqa: PLR0913
     Raises
     ------
     ValueError
-        If the scene has no such amplitude, a target has a unit that the case or the amplitude has
-        not, or the length of the first step is unknown.
+        If the scene has no such amplitude, an argument is none of the words above, a target has a
+        unit that the case or the amplitude has not, or the length of the first step is unknown.
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
+    _refuse_unknown_words(control=(control, Control), until=(until, Until))
+    _refuse_unknown_words(quantity=(quantity, Quantity))
+    if not (start is None or isinstance(start, Record | State)):
+        raise ValueError(f"trace: start: a {type(start).__name__}: give a record or a state")
+    if steps < 1:
+        raise ValueError(f"trace: steps: {steps}: give a number from 1 on")
     if isinstance(scene, Record):
-        record = scene
-        if record.scene is None:
-            raise ValueError("trace: this record comes from another process: give a model as well")
-        scene, start = record.scene, start or record
+        start = start or scene
+        scene = scene.known_scene("trace", "give a model as well")
     scene.read_functions()
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
     scene.refuse_foreign(state)
@@ -207,10 +211,28 @@ def trace(  # noqa: PLR0913
     records_of_path = follow_path(load_stage(scene), path, first_point, goal)
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _with_reached(
-        (replace(record, shown=scene.displacement, scene=scene) for record in records),
+        (record.of_scene(scene) for record in records),
         name,
         targets,
     )
+
+
+def _refuse_unknown_words(**arguments: tuple[str, Any]) -> None:
+    """Check that arguments of `trace` are words that it knows.
+
+    Parameters
+    ----------
+    arguments
+        Name of the argument -> the word, and the `Literal` of all that are allowed.
+
+    Raises
+    ------
+    ValueError
+        With the first other word, and those that are allowed.
+    """
+    for name, (word, words) in arguments.items():
+        if word not in get_args(words):
+            raise ValueError(f"trace: {name}: {word!r}: allowed are {', '.join(get_args(words))}")
 
 
 def _refuse_without_effect(scene: Scene, name: str, state: State, change: float) -> None:

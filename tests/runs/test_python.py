@@ -12,7 +12,9 @@ import pandas
 import pytest
 import pyvista
 from conftest import CASES
+from dolfinx import fem, plot
 from matplotlib.image import imread
+from mpi4py import MPI
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.output.store.table import COLUMNS
@@ -150,3 +152,29 @@ def test_frequencies_and_gradients_need_no_folder() -> None:
     assert gradient["fields"]["thickness"]["alike"][0] == pytest.approx(
         -3 * gradient["value"], rel=1e-4
     )
+
+
+def test_functions_in_files_of_others(tmp_path: Path) -> None:
+    """A displacement and a mode, node by node; pyvista reads them, and io4dolfinx where it is."""
+    coarse = ["symmetry=half", "mesh.refinement=0.4"]
+    model = ms.Model(ms.Case.load(CASES / "clamped_plate.yaml", coarse))
+    *_, record = ms.follow(model)
+    model.put(record)
+    mode = model.modes(1)[0].u
+    assert mode is not None
+    suffix = "vtkhdf" if pyvista.vtk_version_info >= (9, 4) else "vtu"
+    for name, u in (("displacement", record.u), ("mode", mode)):
+        grid = pyvista.UnstructuredGrid(*plot.vtk_mesh(u.function_space))
+        grid["u"] = u.x.array.reshape(-1, 3)
+        grid.save(tmp_path / f"{name}.{suffix}")
+        assert np.array_equal(pyvista.read(tmp_path / f"{name}.{suffix}")["u"], grid["u"])
+        assert np.ptp(grid.points, axis=0)[:2] == pytest.approx([2, 1])
+    io4dolfinx = pytest.importorskip("io4dolfinx")
+    file = tmp_path / "plate.h5"
+    io4dolfinx.write_mesh(file, record.u.function_space.mesh, backend="h5py")
+    io4dolfinx.write_function(file, record.u, backend="h5py")
+    mesh = io4dolfinx.read_mesh(file, MPI.COMM_WORLD, backend="h5py")
+    copy = fem.Function(fem.functionspace(mesh, record.u.function_space.ufl_element()))
+    copy.name = record.u.name
+    io4dolfinx.read_function(file, copy, backend="h5py")
+    assert np.linalg.norm(copy.x.array) == pytest.approx(np.linalg.norm(record.u.x.array))

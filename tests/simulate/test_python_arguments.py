@@ -6,15 +6,33 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import basix.ufl
+import numpy as np
 import pytest
 from conftest import CASES
+from dolfinx import fem, mesh
+from mpi4py import MPI
+from petsc4py import PETSc
 from pydantic import BaseModel
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.parts.foundation import Foundation
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
-from magshell_fenicsx.parts.registered import STEPS
+from magshell_fenicsx.parts.natural.section import NaturalSection
+from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
+from magshell_fenicsx.problem.mesh_sizes import MeshSection
 from magshell_fenicsx.problem.problem import Document
-from magshell_fenicsx.python_keys import FieldKeys, ForceKeys, PressureKeys
+from magshell_fenicsx.python_keys import (
+    FieldKeys,
+    ForceKeys,
+    FoundationKeys,
+    MeshKeys,
+    NaturalKeys,
+    PressureKeys,
+    SectionName,
+    StepKeys,
+    StepKind,
+)
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
@@ -155,6 +173,31 @@ def test_keys_of_loads_are_those_of_a_case(keys: type, section: type[BaseModel])
             assert annotation in (known, *get_args(known))
 
 
+def test_keys_of_steps_are_those_of_a_case() -> None:
+    """Of all kinds together; each has its words."""
+    assert {*get_args(StepKind)} == {*STEPS} | {former for former, _ in FORMER_KINDS}
+    assert {*get_type_hints(StepKeys)} == {
+        key for section in STEPS.values() for key in section.model_fields
+    } - {"kind"}
+    controls = {
+        word
+        for section in STEPS.values()
+        if "control" in section.model_fields
+        for word in get_args(section.model_fields["control"].annotation)
+    }
+    assert {*get_args(get_type_hints(StepKeys)["control"])} == controls
+
+
+@pytest.mark.parametrize(
+    ("keys", "section"),
+    [(FoundationKeys, Foundation), (NaturalKeys, NaturalSection), (MeshKeys, MeshSection)],
+)
+def test_keys_of_sections_are_those_of_a_case(keys: type, section: type[BaseModel]) -> None:
+    assert {*keys.__annotations__} == {*section.model_fields}
+    assert {*get_args(SectionName)} < {*ms.Case.model_fields}
+    assert ms.Section("sensors", tip={"position": [0, 0, 2]}).key == "sensors"
+
+
 def test_keys_of_a_field_are_those_of_a_case() -> None:
     known_otherwise = {"remanent", "applied", "lambda_m"}
     assert {*FieldKeys.__annotations__} == {*MagneticSection.model_fields} - known_otherwise
@@ -179,3 +222,140 @@ def test_keys_of_a_field_are_those_of_a_case() -> None:
 def test_messages_say_what_to_write(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(ms.CaseError, match=re.escape(message)):
         make()
+
+
+def surface_of_triangles() -> mesh.Mesh:
+    flat = mesh.create_rectangle(MPI.COMM_SELF, [(0, 0), (1, 1)], (2, 2))
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
+    dofmap = flat.geometry.dofmap.astype(np.int64)
+    return mesh.create_mesh(MPI.COMM_SELF, dofmap, flat.geometry.x, element)
+
+
+def shell_of(surface: mesh.Mesh | None = None, **keys: Any) -> ms.Shell:
+    if surface is None:
+        surface = surface_of_triangles()
+        surface.topology.create_connectivity(1, 2)
+        keys = {"edges": {"rim": mesh.exterior_facet_indices(surface.topology)}, **keys}
+    return ms.Shell(surface, **{"thickness": 0.02, **keys})
+
+
+def problem_of(*parts: Any, **keys: Any) -> ms.Problem:
+    shell = shell_of(poisson_ratio=0.3, **keys)
+    return ms.Problem(shell, ms.Clamped("rim"), *(parts or [ms.Pressure()]))
+
+
+def cell_tags(surface: mesh.Mesh) -> mesh.MeshTags:
+    return mesh.meshtags(surface, 2, np.arange(2, dtype=np.int32), np.ones(2, dtype=np.int32))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: shell_of(mesh.create_unit_cube(MPI.COMM_SELF, 1, 1, 1)),
+            "its cells are of the kind tetrahedron; a mid-surface has triangles",
+        ),
+        (
+            lambda: shell_of(
+                mesh.create_unit_square(MPI.COMM_SELF, 1, 1, mesh.CellType.quadrilateral)
+            ),
+            "its cells are of the kind quadrilateral; a mid-surface has triangles",
+        ),
+        (
+            lambda: shell_of(edges=["rim"]),
+            "shell.edges: ['rim']: give names with their values: edges={\"rim\": 2}",
+        ),
+        (lambda: shell_of(edges={"rim": 2}), "edges.rim: 2: is a value of tags: give facet_tags"),
+        (
+            lambda: shell_of(
+                surface := surface_of_triangles(), edges={"rim": 1}, facet_tags=cell_tags(surface)
+            ),
+            "edges.rim: 1: is a value of tags: give facet_tags",
+        ),
+        (
+            lambda: shell_of(
+                surface := surface_of_triangles(), thickness=fem.Constant(surface, 0.02)
+            ),
+            "shell.thickness: is a length alone: give a number or text, and thickness_factor",
+        ),
+        (lambda: problem_of(thickness=-0.02), "shell.thickness: -0.02: must be greater than 0"),
+        (
+            lambda: problem_of(thickness_factor="1 + 0.2*r"),
+            "shell.thickness_factor: '1 + 0.2*r': allowed are numbers, x, y, z, pi",
+        ),
+        (
+            lambda: problem_of(thickness_factor=fem.Constant(surface_of_triangles(), 1.0)),
+            "shell.thickness_factor: is a constant on another mesh than that of the shell",
+        ),
+        (
+            lambda: problem_of([ms.Pressure()]),
+            "[Pressure()]: allowed are what ms.Clamped, ms.Field, ms.Step, ... give",
+        ),
+        (
+            lambda: problem_of(ms.Pressure(until="buckling")),  # type: ignore[arg-type]
+            "loading.until: 'buckling': must be 'limit', 'bifurcation', 'target'",
+        ),
+        (
+            lambda: problem_of(ms.OwnTerm("pressure", lambda r0, u: u.r[2] ** 2)),
+            "terms: pressure: something else has this name already: an amplitude or a column",
+        ),
+        (
+            lambda: ms.Problem(shell_of(), points=[[0, 0, 0]]),  # type: ignore[arg-type]
+            'points: [[0, 0, 0]]: give names with their values: points={"tip": [1, 0, 0]}',
+        ),
+        (
+            lambda: ms.Model(FILE, comm=2),  # type: ignore[arg-type]
+            "comm: 2: give a communicator, such as MPI.COMM_WORLD of mpi4py",
+        ),
+        (
+            lambda: ms.sweep(FILE, "a=1,2", executor=4),  # type: ignore[arg-type]
+            "executor: 4: is no executor: give one of concurrent.futures",
+        ),
+    ],
+)
+def test_mistakes_in_problems(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises((ms.CaseError, ms.MeshError), match=re.escape(message)):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        (lambda model: model.set(presure=1), "set: presure: the scene has no such amplitude, only"),
+        (lambda model: model.set(pressure=[1]), "set: pressure: [1]: must be a number, or text"),
+        (
+            lambda model: model.put(np.zeros(3)),
+            "put: a ndarray: give a state, a record, or a PETSc",
+        ),
+        (
+            lambda model: model.put(PETSc.Vec().createSeq(5, comm=MPI.COMM_SELF)),
+            "put: a vector of 5 unknowns on this rank, where the model has",
+        ),
+        (
+            lambda model: model.function(np.zeros(7)),
+            "function: a vector of 7 unknowns on this rank",
+        ),
+        (lambda model: model.modes(0), "modes: 0: give a number from 1 on"),
+        (
+            lambda model: next(ms.trace(model, "pressure", np.zeros(3))),
+            "trace: start: a ndarray: give a record or a state",
+        ),
+        (
+            lambda model: next(ms.trace(model, "pressure", control="laod")),
+            "trace: control: 'laod': allowed are load, conjugate, arc",
+        ),
+        (
+            lambda model: next(ms.trace(model, "pressure", until="limits")),
+            "trace: until: 'limits': allowed are limit, bifurcation, target, points",
+        ),
+        (
+            lambda model: next(ms.trace(model, "pressure", steps=0)),
+            "trace: steps: 0: give a number from 1 on",
+        ),
+        (lambda model: ms.columns([], model), "columns: give the model first, then what follow"),
+        (lambda model: ms.surface(model, model), "surface: give the model first, then what follow"),
+    ],
+)
+def test_mistakes_with_a_model(plain: Any, use: Callable[[Any], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        use(plain)

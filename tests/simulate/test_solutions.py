@@ -72,7 +72,7 @@ def test_a_roof_has_snapped_through() -> None:
         True,
         True,
     ]
-    back = list(ms.solutions(scene, by_hand[1], most=1, guesses=8))  # from the snapped roof
+    back = list(by_hand[1].solutions(most=1, guesses=8))  # from the snapped roof
     assert min(apart(scene, back[0].point.state, other) for other in (result.last, found[0])) < 1e-8
 
 

@@ -49,6 +49,8 @@ from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import SceneCache
+from magshell_fenicsx.simulate.sensitivity import sensitivities
+from magshell_fenicsx.simulate.steps import fold_at
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
@@ -300,12 +302,12 @@ def gradient(
     record: Record,
     *,
     of: str | Target,
-    by: str | Sequence[str],
+    by: str | Sequence[str] | None = None,
     fold: Fold | None = None,
     hold: Mapping[str, str] | None = None,
     begin: Record | None = None,
 ) -> dict[str, Gradient]:
-    """The derivatives of a result at a record; collective.
+    """Return the derivatives of a result at a record; collective.
 
     Parameters
     ----------
@@ -322,9 +324,11 @@ def gradient(
         ("magnetic.remanent.polar"), and fields: "remanence" (vectors over |B^r|, of a meridian
         along e_rho, e_theta, e_z), "magnitude" (a factor of it), "thickness" (over h), "curvature"
         (the natural one over 1/R in the case's frame: 11, 22, 12) and "deviation" (w0 over R, along
-        the outward normal of the perfect shell).
+        the outward normal of the perfect shell). None: of the amplitude of a fold ("instability"),
+        all that `sensitivities` has: by every other amplitude, by the numbers of imperfections, and
+        by a relative change of each patch's remanence.
     fold
-        Of `fold_at`, if it is known.
+        The fold at the record with its null vector, of `fold_at`, if it is known.
     hold
         Amplitude -> "load" or "conjugate": what stays while p changes. By default what the record's
         step holds, and the displacement where that is its control.
@@ -338,10 +342,21 @@ def gradient(
     Raises
     ------
     CaseError
-        If the scene has no such result or parameter.
+        If the scene has no such result or parameter, or `by` is left out of a result that is no
+        "instability".
+    ValueError
+        If `by` is left out at a record that is no fold.
     FoldLost
         If Newton's method for the fold fails.
     """
+    Scene.refuse_other_arguments("gradient", scene, [record])
+    if by is None:
+        if of != "instability":
+            raise CaseError(
+                f"gradient: by: is left out, which needs of='instability', not {of!r}: give an "
+                'amplitude, the key of a number or a field, such as "shell.poisson_ratio"'
+            )
+        return dict(sensitivities(scene, fold or fold_at(scene, record), record))
     fold_amplitude = FOLDS.get(of) if isinstance(of, str) else None
     if fold_amplitude and record.amplitude != fold_amplitude:
         raise CaseError(
