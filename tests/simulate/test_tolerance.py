@@ -193,22 +193,29 @@ def test_ends_of_several_shells_are_carried() -> None:
     assert found.value == pytest.approx(by_path(finer).value, rel=1e-9)
 
 
-@pytest.mark.slow
 def test_ends_of_shells_that_touch_are_carried() -> None:
-    """With cuts and penalties of their own, which the path changes elsewhere: its force,
-    8.80658e-6, to 1e-3.
+    """On meridians, with penalties that are made fit; against a path on the finer scene."""
+    low, finer = _domes_that_touch("coaxial_domes.yaml", 0.5)
+    carried = near_by(finer, low, by_path(low))
+    assert carried
+    assert carried.value == pytest.approx(by_path(finer).value, rel=1e-6)
 
-    From a coarser mesh than this Newton's method does not reach the end, and the path is computed
-    anew.
+
+@pytest.mark.slow
+def test_ends_of_surfaces_that_touch_are_found() -> None:
+    """Newton's method from the other end does not reach it there, and its path is computed anew.
+
+    The force of the sector of 10 degrees is that of the meridian of whole domes, over 36.
     """
-    case = Case.load(
-        CASES / "stacked_domes.yaml",
-        ["loading.displacement=0.1", "mesh={degree: 3, refinement: 0.722}"],
-    )
-    low, finer = (Choice(degree, 0.722).scene(case.problem(), COMM) for degree in (3, 4))
-    found = near_by(finer, low, by_path(low))
-    assert found
-    assert found.value == pytest.approx(8.80658e-6, rel=1e-3)
+    low, finer = _domes_that_touch("stacked_domes.yaml", 0.722)
+    assert from_near(finer, low, by_path(low)).value == pytest.approx(3.16780e-4 / 36, rel=1e-3)
+
+
+def _domes_that_touch(file: str, refinement: float) -> list[Scene]:
+    """Scenes of degree 3 and 4."""
+    mesh = f"mesh={{degree: 3, refinement: {refinement}}}"
+    case = Case.load(CASES / file, ["loading.displacement=0.1", mesh])
+    return [Choice(degree, refinement).scene(case.problem(), COMM) for degree in (3, 4)]
 
 
 def test_ends_with_moved_supports_are_carried_on() -> None:
