@@ -10,8 +10,8 @@ from math import nan
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.penalty_contact import PressedPoints
@@ -51,8 +51,8 @@ def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPe
     if not contacts:
         return None
     evaluation = model.system.at_state(state)
-    of_contacts = evaluation.evaluate(lambda: [c.pressed_points() for c in contacts])
-    points = PressedPoints.gathered(of_contacts, comm)
+    points_of_contacts = evaluation.evaluate(lambda: [c.pressed_points() for c in contacts])
+    points = PressedPoints.gathered(points_of_contacts, comm)
     if not len(points.pressure):
         return None
     forces = points.pressure * points.area
@@ -69,7 +69,7 @@ def _along_meridian(points: PressedPoints, forces: Array) -> float:
     rho = points.places[:, 0]
     around = 2 * np.pi * np.maximum(rho, np.finfo(float).tiny)
     size = points.cell_area / around
-    neighbours = cKDTree(points.places).query_ball_point(points.places, size)
+    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places, size)
     sums = np.array([(forces[near] / around[near]).sum() for near in neighbours])
     largest = int(sums.argmax())
     is_spot = rho[largest] < 2 * size[largest]  # about the axis
@@ -81,15 +81,17 @@ def _along_surface(points: PressedPoints, forces: Array) -> float:
     count = len(forces)
     chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
     reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[chosen])
-    neighbours = cKDTree(points.places).query_ball_point(points.places[chosen], reach)
-    of_points = np.array([_per_length(points.places[near], forces[near]) for near in neighbours])
-    is_line, weights = np.isfinite(of_points), forces[chosen]
+    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places[chosen], reach)
+    forces_per_length = np.array(
+        [_per_length(points.places[near], forces[near]) for near in neighbours]
+    )
+    is_line, weights = np.isfinite(forces_per_length), forces[chosen]
     if weights[is_line].sum() < weights.sum() / 2:
         return nan
-    order = np.argsort(of_points[is_line])
+    order = np.argsort(forces_per_length[is_line])
     weights = weights[is_line][order]
     middle = np.searchsorted(np.cumsum(weights), weights.sum() / 2)
-    return float(of_points[is_line][order][middle])
+    return float(forces_per_length[is_line][order][middle])
 
 
 def _per_length(places: Array, forces: Array) -> float:
