@@ -69,7 +69,7 @@ MAX_DISPLACEMENT = 0.05  # of h: farther from it, an equilibrium is another one
 MAX_STIFFENINGS = 4  # times that bodies become stiffer
 
 
-def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> State:
+def state_at_first_contact(stage: Stage, step: ProgrammeStep, state: State) -> State:
     """Return the state just after the body of a step first touches the shell; collective.
 
     The given state returns if the body touches already. If the step's target is nearer than the
@@ -77,6 +77,8 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
 
     Parameters
     ----------
+    stage
+        The scene with the solver of the step.
     step
         Step whose amplitude is the approach of a body, over h.
 
@@ -85,7 +87,7 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    name, h = step.name, scene.problem.material.h
+    scene, name, h = stage.scene, step.name, stage.scene.problem.material.h
     # the target is a pair: what it prescribes, and the value
     target = step.load.end.goal
     end_of_approach = inf
@@ -111,11 +113,10 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     # a little beyond, so that there is a force; less far where there is no equilibrium
     for depth in FIRST_CONTACT_DEPTHS:
         approach = state.mu[name] + depth
-        outcome = scene.newton.solve(
-            state.with_(state.u, name, approach), name, PrescribedLoad(name, approach)
-        )
+        guess = stage.enter(state.with_(state.u, name, approach))
+        outcome = stage.newton.solve(guess, name, PrescribedLoad(name, approach))
         if outcome.converged:
-            return outcome.state
+            return stage.leave(outcome.state)
         reason = outcome.reason
     raise Stopped(f"no equilibrium found at the first contact: {reason}")
 

@@ -77,7 +77,9 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         held_conjugates = held_conjugates_of_step(scene, step, state)
         return (yield from motion_records(scene, load, state, held_conjugates))
     if load.touches:
-        state = state_at_first_contact(scene, step, state)
+        # what the step holds is held from here on, also at the first touch
+        stage = make_stage(scene, state, held_conjugates_of_step(scene, step, state))
+        state = state_at_first_contact(stage, step, state)
     course = load.course(_step_start(scene, step, state))
     if course.impossible:
         raise Stopped(course.impossible)

@@ -219,3 +219,25 @@ def test_force_control_and_a_held_force(tmp_path: Path) -> None:
     assert approach[0] == pytest.approx(0.3054, rel=1e-3)
     assert approach[1] > approach[0]
     assert not (out / "contact.png").exists()  # nothing touches at the end
+
+
+def test_a_force_is_held_while_another_body_comes() -> None:
+    """Two weights on a cantilever: that of the first stays when the second one touches."""
+    first, second = (
+        {"kind": "contact", "body": body, "control": "force", "force": 1e-3, "points": 1}
+        for body in ("a", "b")
+    )
+    ball = {"kind": "sphere", "radius": 0.1, "direction": [0, 0, -1]}
+    case = {
+        "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2}
+        | {"poisson_ratio": 0},
+        "boundary": {"root": "clamped"},
+        "bodies": {
+            "a": ball | {"position": [0.5, 0, 0.111]},
+            "b": ball | {"position": [0.9, 0, 0.15]},
+        },
+        "mesh": {"degree": 3, "size": 0.15},
+        "loading": [first, second | {"hold": {"approach_a": "conjugate"}}],
+    }
+    row = run(Case.from_source(case)).rows[-1]
+    assert (row["force_a"], row["force_b"]) == pytest.approx((1e-3, 1e-3), rel=1e-5)
