@@ -303,7 +303,9 @@ class DegreeComparison:
         newton, name = stage.newton, self.record.amplitude
         system, unstable_before = newton.system, self.record.point.negative_pivots
         state, tangent = _held_along_mode(newton, guess, critical_mode(newton, guess).vector)
-        if self._others_are_first(tangent.unstable, unstable_before):
+        # with a held conjugate the lowest mode may be one that the hold stabilises
+        is_simple = stage.device is None
+        if is_simple and self._others_are_first(tangent.unstable, unstable_before):
             lowest = lowest_mode(system.tangent(state.u, state.mu))
             state, tangent = _held_along_mode(newton, state, lowest)
         else:

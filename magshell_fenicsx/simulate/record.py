@@ -90,9 +90,9 @@ class Record:
         unstable = self.point.negative_pivots + self.excluded_pivots
         return f"Record {self.label}{mode}: {amplitudes or 'no load'}; {unstable} unstable"
 
-    def of_scene(self, scene: "Scene", step: int = 0) -> "Record":
-        """Return the record as a point of a scene, found by a step of its programme or by none."""
-        return replace(self, step=step, scene=scene)
+    def of_scene(self, scene: "Scene", step: int | None = None) -> "Record":
+        """Return the record as a point of a scene, with the number of a step or with its own."""
+        return replace(self, step=self.step if step is None else step, scene=scene)
 
     def known_scene(self, name: str, advice: str = "") -> "Scene":
         """Return the scene of the point.

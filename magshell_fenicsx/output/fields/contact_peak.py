@@ -56,10 +56,13 @@ def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPe
     if not len(points.pressure):
         return None
     forces = points.pressure * points.area
-    line_force = _along_meridian if len(model.axes) == 2 else _along_surface
+    if len(model.axes) == 2:
+        line_force = _along_meridian(points, forces)
+    else:  # of a part of the shell the images of the points are missing
+        line_force = _along_surface(points, forces) if model.multiplicity == 1 else nan
     return ContactPeak(
         float(points.pressure.max()),
-        line_force(points, forces),
+        line_force,
         float(model.multiplicity * forces.sum()),
     )
 
