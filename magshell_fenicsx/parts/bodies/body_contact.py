@@ -103,6 +103,11 @@ class ContactBody:
     start: Array | None = None
     lift: Array | None = None
 
+    @property
+    def reference_point(self) -> Array:
+        """Place (3,) over R of the body's reference point at approach zero."""
+        return np.asarray(self.front - self.front_offset * self.direction)
+
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
         """Return the gap (n,) between the body and the shell's face, with its gradient and Hessian.
 
@@ -736,11 +741,11 @@ class BodyContact(PenaltyContact[PointConfiguration, Array]):
         point, where it is at present. On a meridian a force is the sum of the forces at azimuth
         zero that the ring of a point has.
         """
-        body, own = self.contact, slice(0, self._owned)
-        forces = (self._area_memo.renew()[..., None] * self._tractions())[own]
+        body, own_cells = self.contact, slice(0, self._owned)
+        forces = (self._area_memo.renew()[..., None] * self._tractions())[own_cells]
         # relative to the body, which is then at approach zero
-        places = (self._placement_memo.renew() + self.place)[own]
-        arms = places - (body.front - body.front_offset * body.direction)
+        places = (self._placement_memo.renew() + self.place)[own_cells]
+        arms = places - body.reference_point
         return forces, np.asarray(np.cross(arms, forces), np.float64)
 
     def region(self) -> Region:

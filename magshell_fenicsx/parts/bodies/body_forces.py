@@ -41,7 +41,8 @@ class BodyForcesObservables(Observables):
         evaluation, frame = model.system.at_state(state), rotation(view.azimuth)
         for contact in model.contacts.values():
             sums = evaluation.evaluate(partial(_sums, contact, model))
-            force, moment = _of_whole(sums[:3], sums[3:6], model, view.mirror)
+            point = contact.contact.reference_point
+            force, moment = _whole_force_and_moment(sums[:3], sums[3:6], point, model, view.mirror)
             numbers = (
                 *(sums[6:] / model.force_unit),
                 *(view.force * force @ frame),
@@ -75,12 +76,22 @@ def _sums(contact: "BodyContact", model: "ObservedModel") -> Array:
     return np.asarray(model.system.comm.allreduce(sums))
 
 
-def _of_whole(
-    force: Array, moment: Array, model: "ObservedModel", mirror: Mirror | None
+def _whole_force_and_moment(
+    force: Array, moment: Array, point: Array, model: "ObservedModel", mirror: Mirror | None
 ) -> tuple[Array, Array]:
-    """Return force and moment (3,) of the whole shell from those of the modelled part."""
+    """Return force and moment (3,) of the whole shell from those of the modelled part.
+
+    Moments are about a point (3,), which need not be its own image. The moment of an image is about
+    the image of the point, from where it is shifted.
+    """
     if len(model.axes) == 2:  # a meridian: around the axis all but the force along it cancels
-        return force * [0.0, 0.0, 1.0], 0 * moment
+        axial_force = force * [0.0, 0.0, 1.0]
+        to_axis = point * [-1.0, -1.0, 0.0]
+        return axial_force, np.asarray(np.cross(to_axis, axial_force), np.float64)
     if mirror is None:
         return force, moment
-    return mirror.sum_over_images(force), mirror.sum_over_images(moment, -1.0)
+    moments = [
+        image.sign * image.Q @ moment + np.cross(image.apply(point) - point, image.Q @ force)
+        for image in mirror.images
+    ]
+    return mirror.sum_over_images(force), np.asarray(sum(moments))

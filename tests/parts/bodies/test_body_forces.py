@@ -61,6 +61,57 @@ def test_models_agree() -> None:
     assert rows[1]["plate_normal_force"] == pytest.approx(rows[0]["plate_normal_force"], rel=0.01)
 
 
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+def test_moment_about_a_point_off_the_axis(symmetry: str) -> None:
+    """A plate presses at the pole: the moment is that of its force there."""
+    position = np.array([0.3, 0.2, 1 + 1 / 80])
+    (row,) = targets(
+        shell=HEMISPHERE,
+        boundary={"equator": "clamped"},
+        bodies={
+            "plate": {
+                "kind": "plane", "stiffness": 1e3, "penetration": 0.1,
+                "position": position.tolist(), "direction": [0, 0, -1],
+            }
+        },
+        loading={"kind": "contact", "approach": 0.5, "points": 1},
+        mesh={"degree": 3, "refinement": 0.4},
+        symmetry=symmetry,
+    )  # fmt: skip
+    force = vector(row, "plate", "contact_f")
+    expected = np.cross([0, 0, position[2]] - position, force)
+    assert np.linalg.norm(expected) > 0.3 * abs(force[2])
+    assert vector(row, "plate", "contact_m") == pytest.approx(expected, abs=2e-3 * force[2])
+
+
+@pytest.mark.parametrize("symmetry", ["half", "none"])
+def test_moment_about_a_point_off_the_mirror_plane(symmetry: str) -> None:
+    """A bar across a cantilever, whose reference point is on an edge: the force is in the middle.
+
+    The ball on which it rests has its centre as reference point: its forces have no moment.
+    """
+    bar = {"kind": "cylinder", "radius": 0.1, "axis": [0, 1, 0], "direction": [0, 0, -1]}
+    ball = {"kind": "sphere", "radius": 0.1, "direction": [0, 0, 1], "side": "inside"}
+    (row,) = targets(
+        shell=STRIP,
+        boundary={"left": "clamped"},
+        bodies={
+            "bar": bar | {"position": [0.9, 0, 0.1 + h / 2]},
+            "ball": ball | {"position": [0.5, WIDTH / 2, -0.1 - h / 2]},
+        },
+        loading={"kind": "contact", "body": "bar", "approach": 2, "points": 1},
+        mesh={"degree": 3, "size": 0.2},
+        symmetry=symmetry,
+    )
+    force, moment = (vector(row, "bar", f"contact_{kind}") for kind in "fm")
+    assert moment[[0, 2]] == pytest.approx(
+        WIDTH / 2 * np.array([force[2], -force[0]]), rel=1e-6, abs=1e-9 * force[2]
+    )
+    assert moment[1] == pytest.approx(0, abs=1e-6 * force[2])
+    assert row["ball_normal_force"] > row["bar_normal_force"]
+    assert vector(row, "ball", "contact_m") == pytest.approx(np.zeros(3), abs=1e-9 * force[2])
+
+
 h, WIDTH = 0.01, 0.1
 STRIP = {
     "geometry": "plate", "length": 1, "width": WIDTH, "thickness": h, "youngs_modulus": 1,
