@@ -265,7 +265,7 @@ class Model(Scene):
         if not (self.allows_rigid_motion or self.free_in_time):
             pivots = self.newton.factor_at(state).negative_pivots
         point = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots)
-        return Record("target", "", point).of_scene(self)
+        return Record("target", "", point).with_scene(self)
 
     def modes(self, count: int = 6) -> list[Mode]:
         """Return the natural modes of lowest frequency at the state, ascending.

@@ -22,6 +22,7 @@ SectionName: TypeAlias = Literal[  # whose keys are free, or many
     "frequencies",
     "gradients",
     "identify",
+    "joints",
     "magnetic",
     "output",
     "points",

@@ -341,7 +341,9 @@ def null_vector(K: Tangent) -> Vector:
 def lowest_mode(K: Tangent) -> Vector:
     """Return the eigenvector of a tangent's lowest eigenvalue. Collective.
 
-    If the tangent is skewed, it is that of its symmetric part.
+    If the tangent is skewed, it is that of its symmetric part. A border is left out. Constrained
+    unknowns have the eigenvalues of their rows, which are positive: the lowest one is of a mode
+    wherever a direction is unstable.
 
     Raises
     ------

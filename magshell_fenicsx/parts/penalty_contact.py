@@ -89,7 +89,7 @@ class PressedPoints:
     cell_area: Array
 
     @classmethod
-    def gathered(cls, parts: "Sequence[PressedPoints]", comm: MPI.Comm) -> "PressedPoints":
+    def union(cls, parts: "Sequence[PressedPoints]", comm: MPI.Comm) -> "PressedPoints":
         """Return the points of several contacts and of all ranks as one set; collective."""
         tables = [
             np.column_stack([part.places, part.pressure, part.area, part.cell_area])

@@ -390,7 +390,7 @@ class MeridianModel(ThinModel):
 
     @property
     def shell_cells(self) -> Mapping[str, NDArray[np.bool_]]:
-        return self.meridian.patches
+        return {name: self.meridian.patches[name] for name in self.meridian.shells}
 
     def _make_shell_contacts(self) -> "Sequence[MeridianContact]":
         """Return the contacts between parts of the shell; empty without contact pairs."""

@@ -290,7 +290,7 @@ class DegreeComparison:
         A force along the mode b holds the displacement along b near the point, so that the tangent
         stays regular. The mode is neutral where K v + g b = 0, b . v = 1 gives g = 0: one step of
         Newton's method along the path goes there. Where other modes are unstable with one degree
-        more, as the other one of a pair, the lowest mode is neutral first.
+        more, as those of pairs of waves, the lowest mode is neutral first.
 
         Raises
         ------
@@ -304,8 +304,8 @@ class DegreeComparison:
         system, unstable_before = newton.system, self.record.point.negative_pivots
         state, tangent = _held_along_mode(newton, guess, critical_mode(newton, guess).vector)
         # with a held conjugate the lowest mode may be one that the hold stabilises
-        is_simple = stage.device is None
-        if is_simple and self._others_are_first(tangent.unstable, unstable_before):
+        has_free_conjugates = stage.device is None
+        if has_free_conjugates and self._others_are_first(tangent.unstable, unstable_before):
             lowest = lowest_mode(system.tangent(state.u, state.mu))
             state, tangent = _held_along_mode(newton, state, lowest)
         else:

@@ -82,7 +82,7 @@ def follow(
     yield from _start(scene, state, has_rise=bool(energies))
     for name, value in energies.items():
         rise = RecordStream(_rise(scene, name, value, state))
-        yield from (record.of_scene(scene) for record in rise)
+        yield from (record.with_scene(scene) for record in rise)
         state = rise.end
     for step in steps:
         run = _StepRun(scene, step, remark)
@@ -153,7 +153,7 @@ def _search_records(
     from magshell_fenicsx.simulate.search import search_at_end_of_step
 
     for record in search_at_end_of_step(scene, step, begin, end):
-        yield record.of_scene(scene, step.number)
+        yield record.with_scene(scene, step.number)
 
 
 def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
@@ -176,7 +176,7 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
         """Return the record of the undeformed shell with so many unstable directions."""
         zero = 0.0 * state.u
         point = Point(state, 0.0, zero, 0.0, pivots, pivots, 0, factorisations)
-        return Record("start", "", point, clock=clock).of_scene(scene)
+        return Record("start", "", point, clock=clock).with_scene(scene)
 
     try:
         _refuse_not_numbers(scene, state, "")
@@ -363,7 +363,7 @@ class _StepRun:
         )
         if message := recorded.values["said"]:
             raise Stopped(message)
-        return record.of_scene(scene, self._step.number)
+        return record.with_scene(scene, self._step.number)
 
 
 def energies_moving_the_shell(scene: Scene, state: State) -> dict[str, float]:

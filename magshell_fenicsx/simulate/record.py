@@ -90,7 +90,7 @@ class Record:
         unstable = self.point.negative_pivots + self.excluded_pivots
         return f"Record {self.label}{mode}: {amplitudes or 'no load'}; {unstable} unstable"
 
-    def of_scene(self, scene: "Scene", step: int | None = None) -> "Record":
+    def with_scene(self, scene: "Scene", step: int | None = None) -> "Record":
         """Return the record as a point of a scene, with the number of a step or with its own."""
         return replace(self, step=self.step if step is None else step, scene=scene)
 
@@ -110,7 +110,7 @@ class Record:
             If the record was pickled.
         """
         if self.scene is None:
-            advice = advice or f"record.of_scene(model).{name}()"
+            advice = advice or f"record.with_scene(model).{name}()"
             raise ValueError(f"{name}: this record comes from another process: {advice}")
         return self.scene
 
@@ -135,7 +135,8 @@ class Record:
 
         `ms.trace(record, name, first=...)` follows one. A mode of the model itself has two, along
         the mode and against it. A mode that the model excludes has one, in the smallest model that
-        has the mode (`record.scene`): the other is the same shape, turned or mirrored.
+        has the mode (`record.scene`): the other is the same shape, turned or mirrored. That model
+        takes over the journal of the run, which must have ended.
 
         Raises
         ------

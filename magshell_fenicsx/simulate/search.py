@@ -248,7 +248,7 @@ def solutions(
         )
     search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
     for record in _solutions(load_stage(scene), name, outcome.state, search):
-        yield record.of_scene(scene)
+        yield record.with_scene(scene)
 
 
 def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> Iterator[Record]:

@@ -348,7 +348,7 @@ def first_records_of_branches(bifurcation: Record) -> list[Record]:
         point = replace(point, state=new_scene.model.system.advance(point.state, state.mu))
         unstable = unstable_count(new_scene.model.symmetry_breaking_modes, point.state)
         record = Record("step", name, point, branch=number, excluded_pivots=unstable)
-        records.append(record.of_scene(new_scene, bifurcation.step))
+        records.append(record.with_scene(new_scene, bifurcation.step))
     return records
 
 

@@ -211,7 +211,7 @@ def trace(  # noqa: PLR0913
     records_of_path = follow_path(load_stage(scene), path, first_point, goal)
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _with_reached(
-        (record.of_scene(scene) for record in records),
+        (record.with_scene(scene) for record in records),
         name,
         targets,
     )

@@ -42,5 +42,5 @@ def test_a_branch_in_a_larger_model() -> None:
     with pytest.raises(ValueError, match="branches: this record is no bifurcation, but a step"):
         before[-1].branches()
     pickled = pickle.loads(pickle.dumps(bifurcation))
-    with pytest.raises(ValueError, match=r"another process: record\.of_scene\(model\)\.branches"):
+    with pytest.raises(ValueError, match=r"another process: record\.with_scene\(model\)\.branches"):
         pickled.branches()

@@ -1,5 +1,6 @@
-"""What the quadrature points of a contact say beside the pressure of cells: the largest pressure,
-and the force per length of a contact that is narrower than a cell.
+"""The largest contact pressure, and the force per length of a contact narrower than a cell.
+
+Both are of the quadrature points, beside the pressure that is a mean over each cell.
 
 Lengths are over R, pressures over E h/R, forces over E h R. On a meridian points are (rho, 0, z),
 and each stands for a ring.
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 REACH_ALONG_LINE = 2.3  # square roots of a cell's area: some one and a half sides
 MAX_WIDTH_OF_LINE = 0.5  # over its length
-MOST_POINTS = 200  # around which the force per length is computed
+MAX_SAMPLED_POINTS = 200  # around which the force per length is computed
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPe
         return None
     evaluation = model.system.at_state(state)
     points_of_contacts = evaluation.evaluate(lambda: [c.pressed_points() for c in contacts])
-    points = PressedPoints.gathered(points_of_contacts, comm)
+    points = PressedPoints.union(points_of_contacts, comm)
     if not len(points.pressure):
         return None
     forces = points.pressure * points.area
@@ -70,10 +71,10 @@ def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPe
 def _along_meridian(points: PressedPoints, forces: Array) -> float:
     """Return the largest force per length of rings, each within the length of a cell."""
     rho = points.places[:, 0]
-    around = 2 * np.pi * np.maximum(rho, np.finfo(float).tiny)
-    size = points.cell_area / around
+    circumference = 2 * np.pi * np.maximum(rho, np.finfo(float).tiny)
+    size = points.cell_area / circumference
     neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places, size)
-    sums = np.array([(forces[near] / around[near]).sum() for near in neighbours])
+    sums = np.array([(forces[indices] / circumference[indices]).sum() for indices in neighbours])
     largest = int(sums.argmax())
     is_spot = rho[largest] < 2 * size[largest]  # about the axis
     return nan if is_spot else float(sums[largest])
@@ -82,13 +83,13 @@ def _along_meridian(points: PressedPoints, forces: Array) -> float:
 def _along_surface(points: PressedPoints, forces: Array) -> float:
     """Return the median of the forces per length around points; nan if most are in spots."""
     count = len(forces)
-    chosen = np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
-    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[chosen])
-    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places[chosen], reach)
+    sample = np.linspace(0, count - 1, min(count, MAX_SAMPLED_POINTS)).astype(int)
+    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[sample])
+    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places[sample], reach)
     forces_per_length = np.array(
-        [_per_length(points.places[near], forces[near]) for near in neighbours]
+        [_per_length(points.places[indices], forces[indices]) for indices in neighbours]
     )
-    is_line, weights = np.isfinite(forces_per_length), forces[chosen]
+    is_line, weights = np.isfinite(forces_per_length), forces[sample]
     if weights[is_line].sum() < weights.sum() / 2:
         return nan
     order = np.argsort(forces_per_length[is_line])
@@ -104,6 +105,8 @@ def _per_length(places: Array, forces: Array) -> float:
     """
     from_middle = places - forces @ places / forces.sum()
     covariance = (forces[:, None] * from_middle).T @ from_middle / forces.sum()
-    *_, across, along = np.linalg.eigvalsh(covariance)
-    is_spot = across > MAX_WIDTH_OF_LINE**2 * along
-    return nan if is_spot or not along else float(forces.sum() / np.sqrt(12 * along))
+    *_, second_variance, largest_variance = np.linalg.eigvalsh(covariance)
+    is_spot = second_variance > MAX_WIDTH_OF_LINE**2 * largest_variance
+    if is_spot or not largest_variance:
+        return nan
+    return float(forces.sum() / np.sqrt(12 * largest_variance))

@@ -40,7 +40,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.fold import FoldLost
-from magshell_fenicsx.continuation.modes import NoEigenpair
+from magshell_fenicsx.continuation.modes import ModesNotFound, NoEigenpair
 from magshell_fenicsx.continuation.system import Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
@@ -525,7 +525,14 @@ def _instability_near_by(scene: Scene, source: Scene, neighbour: Ending) -> Endi
     try:
         state = state_on_other_mesh(source, scene, record, carry)
         tangent = carry(source, scene, neighbour.tangent)
-    except (NotEstimated, NotCarried, FoldLost, NoEigenpair, np.linalg.LinAlgError):
+    except (
+        NotEstimated,
+        NotCarried,
+        FoldLost,
+        NoEigenpair,
+        ModesNotFound,
+        np.linalg.LinAlgError,
+    ):
         return None
     point = replace(record.point, state=state, du=tangent)
     return replace(
