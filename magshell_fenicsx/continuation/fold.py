@@ -57,6 +57,8 @@ FOLD_TOLERANCE = 1e-9  # estimated remaining error of u, over the system's lengt
 FOLD_ROUNDING_STEP = 1e-6
 MAX_ITERATIONS = 8
 MAX_STEP = 10.0  # in lengths; a longer one counts as divergence
+# relative to the norm of K: a smaller diagonal entry is rounding
+ROUNDING_OF_DIAGONAL = 1e-12
 # of the amplitude: a fold further ahead is not estimated well
 MAX_DISTANCE_TO_FOLD = 0.6
 
@@ -94,10 +96,11 @@ def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
     # the row of that entry in the global matrix; on the other ranks there is none
     rows = [first_row + int(i) for i in np.flatnonzero(e)]
     diagonal = comm.allreduce(sum(K.getValue(i, i) for i in rows))
-    # spring and diagonal entry d add up to 2 |d|; where d is zero, the norm of K is the stiffness
-    stiffness = 2 * abs(diagonal) - diagonal
-    if not stiffness:
-        stiffness = K.norm(PETSc.NormType.INFINITY) or 1.0
+    # spring and diagonal entry d add up to 2 |d|; where d is rounding, because the mode is this
+    # degree of freedom alone, the norm of K is the stiffness
+    stiffness, norm = 2 * abs(diagonal) - diagonal, K.norm(PETSc.NormType.INFINITY)
+    if stiffness <= ROUNDING_OF_DIAGONAL * norm:
+        stiffness = norm or 1.0
     for i in rows:
         K.setValue(i, i, stiffness, addv=True)
     K.assemble()

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from continuation.toys import column_of_modes, pitchfork
 
-from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
+from magshell_fenicsx.continuation.continuation_run import (
+    ContinuationGoal,
+    ContinuationRun,
+    _InstabilityLocator,
+)
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
@@ -40,8 +44,12 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
     assert point.state.mu["load"] == first < 1 < last
 
 
-def test_a_fold_that_no_step_resolves_is_told_between_two_branches() -> None:
-    """Koiter's fold at 1 - 3 (1e-6/2)^(2/3), beside the branch of the perfect column."""
+def test_a_fold_that_no_step_resolves_is_told_between_two_branches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Koiter's fold at 1 - 3 (1e-6/2)^(2/3), beside the branch of the perfect column, whose
+    bifurcation is not found."""
+    monkeypatch.setattr(_InstabilityLocator, "solve_bifurcation", lambda *_: None)
     newton = BorderedNewton(pitchfork(1e-6, stiffening=-0.5))
     path = Path(newton, "load", "arc", StepOptions(0.03, 1.5, 0.01))
     start = path.start(State(np.array([0.0, 1e-6]), {"load": 0.0}))
