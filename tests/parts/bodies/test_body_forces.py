@@ -153,39 +153,46 @@ def test_two_fingers_squeeze_a_bar() -> None:
     assert vector(row, "bar", "contact_m") == pytest.approx(np.zeros(3), abs=1e-8 * largest)
 
 
-RESTING: dict[str, tuple[dict[str, Any], float]] = {
+SHELLS: dict[str, tuple[dict[str, Any], float]] = {
     "disc": ({"geometry": "disc", "radius": "1 m"}, np.pi),
     "plate": ({"geometry": "plate", "length": "1 m", "width": "0.5 m"}, 0.5),
 }  # shell, and its area
+SUPPORTING = {
+    "plane": {"kind": "plane", "position": [0, 0, -0.025], "side": "inside"},
+    "box": {
+        "kind": "box", "size": [0.6, 0.6, 0.2], "edge": 0.02, "axis": [1, 0, 0],
+        "position": [0.5, 0.25, -0.125],
+    },
+    "bar": {"kind": "cylinder", "radius": 0.3, "axis": [0, 1, 0], "position": [0.5, 0.25, -0.325]},
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", RESTING)
-def test_weight(name: str) -> None:
-    """A shell without supports rests on a plate, which bears its weight, 1e-3; springs, which would
-    let it sink by its thickness, hold it while it does not touch.
+@pytest.mark.parametrize(
+    ("shell_name", "body_name", "spring"),
+    [("disc", "plane", 1e-5), ("plate", "plane", 1e-5), ("plate", "box", 1e-6),
+     ("plate", "bar", 1e-7)],
+)  # fmt: skip
+def test_weight(shell_name: str, body_name: str, spring: float) -> None:
+    """A shell without supports rests on a body, which bears its weight, 1e-3; springs, which would
+    let it sink by a part of its thickness and more, hold it while it does not touch.
     """
-    shell, area = RESTING[name]
-    acceleration, thickness = 1e-5, 0.05  # over E/(rho R), and R
+    shell, area = SHELLS[shell_name]
+    acceleration, thickness = spring, 0.05  # over E/(rho R), and R
     (row,) = targets(
         shell={
             "thickness": f"{thickness} m", "youngs_modulus": "1 Pa", "poisson_ratio": 0.3,
             "density": "1 kg/m^3", **shell,
         },
         boundary={},
-        foundation={"stiffness": 1e-5, "tangential": 1e-5},
-        bodies={
-            "plate": {
-                "kind": "plane", "position": [0, 0, -thickness / 2], "direction": [0, 0, 1],
-                "side": "inside",
-            }
-        },
+        foundation={"stiffness": spring, "tangential": spring},
+        bodies={"support": {**SUPPORTING[body_name], "direction": [0, 0, 1]}},
         loading={"kind": "gravity", "acceleration": acceleration, "points": 1},
         mesh={"refinement": 0.5},
     )  # fmt: skip
     weight = acceleration * thickness * area
-    assert row["plate_contact_fz"] == pytest.approx(-weight, rel=1e-3)
+    assert row["support_contact_fz"] == pytest.approx(-weight, rel=1e-3)
     unit = 2 * np.pi * thickness**3 / 12 / (1 - 0.3**2)
-    assert unit * row["plate_normal_force"] == pytest.approx(weight, rel=1e-3)
+    assert unit * row["support_normal_force"] == pytest.approx(weight, rel=1e-3)
 
 
 def squeezed_ring(approach: float) -> float:
