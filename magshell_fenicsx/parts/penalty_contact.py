@@ -15,6 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.gap import SOFT_PENETRATION, Penalty
 
 Array = NDArray[np.float64]
@@ -97,6 +98,13 @@ class PressedPoints:
         ]
         table = np.concatenate(comm.allgather(np.concatenate(tables)))
         return cls(table[:, :3], *table[:, 3:].T)
+
+    def with_images(self, mirror: Mirror) -> "PressedPoints":
+        """Return the points of all copies of a half or a sector, one copy after the other."""
+        return PressedPoints(
+            mirror.with_images(self.places),
+            *(np.tile(v, mirror.copies) for v in (self.pressure, self.area, self.cell_area)),
+        )
 
 
 class PenaltyContact(ABC, Generic[Configuration, Frozen]):

@@ -10,6 +10,7 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Sector
 from magshell_fenicsx.output.fields.contact_peak import _along_surface
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import (
@@ -52,6 +53,18 @@ def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
     assert surface.contact_peak.line_force == pytest.approx(force / ring, rel=1e-3)
     assert surface.contact_peak.force == pytest.approx(force)
     assert f"{force / ring:.3g} $Eh$" in pressure_note(surface)
+
+
+def test_the_images_of_a_line_are_one_line() -> None:
+    """3 per length along a line through two mirror planes, of which a quarter of it is modelled."""
+    x = np.arange(0.005, 0.5, 0.01)
+    row = np.full(len(x), 1.0)
+    places = np.column_stack([x, 0 * x, 0 * x])
+    quarter = PressedPoints(places, 1.5e4 * row, 1e-6 * row, 4e-4 * row)
+    whole = quarter.with_images(Sector(np.array([0.0, 1.0, 0.0]), waves=2))
+    assert len(whole.pressure) == 4 * len(x)
+    assert _along_surface(whole, whole.pressure * whole.area) == pytest.approx(3, rel=0.05)
+    assert {(px > 0) for px in whole.places[:, 0]} == {True, False}
 
 
 @pytest.mark.slow

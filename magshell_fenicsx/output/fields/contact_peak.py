@@ -15,6 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.penalty_contact import PressedPoints
 
 if TYPE_CHECKING:
@@ -46,8 +47,13 @@ class ContactPeak:
     force: float
 
 
-def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPeak | None:
-    """Return the numbers of all contacts of a model at a state; None without touch. Collective."""
+def contact_peak(
+    model: "ShellModel | MeridianModel", state: State, mirror: Mirror | None = None
+) -> ContactPeak | None:
+    """Return the numbers of all contacts of a model at a state; None without touch. Collective.
+
+    `mirror` has the images that make the whole shell of a half or a sector.
+    """
     contacts, comm = model.all_contacts, model.system.comm
     if not contacts:
         return None
@@ -56,15 +62,14 @@ def contact_peak(model: "ShellModel | MeridianModel", state: State) -> ContactPe
     points = PressedPoints.union(points_of_contacts, comm)
     if not len(points.pressure):
         return None
+    if mirror:
+        points = points.with_images(mirror)
     forces = points.pressure * points.area
-    if len(model.axes) == 2:
-        line_force = _along_meridian(points, forces)
-    else:  # of a part of the shell the images of the points are missing
-        line_force = _along_surface(points, forces) if model.multiplicity == 1 else nan
+    along_line = _along_meridian if len(model.axes) == 2 else _along_surface
     return ContactPeak(
-        float(points.pressure.max()),
-        line_force,
-        float(model.multiplicity * forces.sum()),
+        pressure=float(points.pressure.max()),
+        line_force=along_line(points, forces),
+        force=float(forces.sum()),
     )
 
 

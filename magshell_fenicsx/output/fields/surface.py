@@ -330,7 +330,8 @@ class SurfaceGatherer:
 
         if state.mu:  # of a mode there are no amplitudes, and no contact
             add_contact(values, self._model, state, at_cell_nodes)
-        peak = contact_peak(self._model, state) if state.mu else None
+        mirror = self._model.mirror if self._model.multiplicity > 1 else None
+        peak = contact_peak(self._model, state, mirror) if state.mu else None
         averaged = {
             name: self._averaged(values_at_cells) for name, values_at_cells in values.items()
         }
