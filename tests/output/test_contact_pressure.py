@@ -3,6 +3,8 @@ it.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from conftest import CASES
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Sector
-from magshell_fenicsx.output.fields.contact_peak import _along_surface
+from magshell_fenicsx.output.fields.contact_peak import ContactPeak, _along_surface
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import (
     GAP_OPEN,
@@ -22,6 +24,7 @@ from magshell_fenicsx.output.fields.surface import (
     resolved_pressure,
 )
 from magshell_fenicsx.output.pictures.colours import contact, pressure_note
+from magshell_fenicsx.output.pictures.plot import PicturedRun, with_contact_errors
 from magshell_fenicsx.parts.penalty_contact import PressedPoints
 from magshell_fenicsx.simulate.follow import follow
 
@@ -118,6 +121,36 @@ def test_force_per_length(rows: int) -> None:
     square = np.random.default_rng(1).uniform(0, 0.01, places.shape) * [1, 1, 0]
     spot = replace(points, places=square)
     assert np.isnan(_along_surface(spot, points.pressure * points.area))
+
+
+@pytest.mark.parametrize(("label", "point"), [("target", 2), ("fold", 1)])
+def test_the_note_has_the_error_of_the_mesh(label: str, point: int) -> None:
+    """Errors of the last point stand beside its numbers alone; those of two bodies add up."""
+    rows = [
+        {
+            "point": number, "branch": 0, "label": label, "amplitude": "force",
+            "contact_pressure_max": 4.0, "a_normal_force": 1.0, "b_normal_force": 3.0,
+        }
+        for number in (1, 2)
+    ]  # fmt: skip
+    errors = {"contact_pressure_max": 0.2, "a_normal_force": 0.01, "b_normal_force": 0.03}
+    run = SimpleNamespace(
+        rows=rows,
+        headline=rows[point - 1],
+        errors={f"{column}@end": error for column, error in errors.items()},
+        resolved={"bodies": {"a": {}, "b": {}}},
+    )
+    points, fields = np.zeros((3, 3)), {PRESSURE: np.full(3, 2.0), "gap_over_h": np.zeros(3)}
+    peak = ContactPeak(pressure=4.0, line_force=0.5, force=4.0)
+    surface = Surface(points, points, points, np.array([[0, 1, 2]]), fields, contact_peak=peak)
+
+    def note(pressure: float) -> str:
+        fields[PRESSURE][:] = pressure
+        return pressure_note(with_contact_errors(surface, cast("PicturedRun", run)))
+
+    is_last = point == 2
+    assert ("$pR/(Eh)$ = 4, with an error of 5 % by the mesh" in note(2.0)) == is_last
+    assert ("0.5 $Eh$, with an error of 1 % by the mesh" in note(np.nan)) == is_last
 
 
 def test_nothing_touches() -> None:

@@ -40,11 +40,15 @@ class ContactPeak:
         Force per length over E h of a contact along a line; nan where it is in a spot.
     force
         Sum of all normal forces, of the whole shell, over E h R.
+    pressure_error, force_error
+        Estimated errors of `pressure` and `force` by the mesh, as parts of them; nan if unknown.
     """
 
     pressure: float
     line_force: float
     force: float
+    pressure_error: float = nan
+    force_error: float = nan
 
 
 def contact_peak(

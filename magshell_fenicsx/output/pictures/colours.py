@@ -368,15 +368,26 @@ def pressure_note(surface: Surface) -> str:
     elif 0 < (number := int((pressure[surface.cells] > 0).all(axis=1).sum())) < MIN_PRESSED_CELLS:
         notes = [f"The pressure is a mean over each cell; {number} carry it."]
     if peak:
-        notes.append(f"The largest at a quadrature point is $pR/(Eh)$ = {peak.pressure:.3g}.")
+        error_text = _error_text(peak.pressure_error)
+        notes.append(
+            f"The largest at a quadrature point is $pR/(Eh)$ = {peak.pressure:.3g}{error_text}."
+        )
     return " ".join(notes)
 
 
 def _line_force_text(peak: ContactPeak) -> str:
     """Return a sentence on the force of a contact whose pressure the mesh does not resolve."""
+    error_text = _error_text(peak.force_error)
     if isnan(peak.line_force):
-        return f"Its force is {peak.force:.3g} $EhR$."
-    return f"Its force per length is {peak.line_force:.3g} $Eh$."
+        return f"Its force is {peak.force:.3g} $EhR${error_text}."
+    return f"Its force per length is {peak.line_force:.3g} $Eh${error_text}."
+
+
+def _error_text(relative_error: float) -> str:
+    """Return words on an estimated relative error, behind a number; none if it is unknown."""
+    if isnan(relative_error):
+        return ""
+    return f", with an error of {100 * relative_error:.1g} % by the mesh"
 
 
 def contact_region(surface: Surface) -> Array | None:

@@ -9,6 +9,7 @@ a picture of the shell that is put on the curve. A motion is a step in time.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
 from magshell_fenicsx.output.pictures.curve_additions import add_shapes, runs_figure
+from magshell_fenicsx.output.pictures.error_band import errors_at_points
 from magshell_fenicsx.output.pictures.field_maps import field_maps_figure
 from magshell_fenicsx.output.pictures.layout import drawing, figure_files
 from magshell_fenicsx.output.pictures.lines import curve_steps
@@ -59,6 +61,7 @@ from magshell_fenicsx.quantities.registry import field_columns
 MAX_PANELS = 12  # of solutions.png
 MAPS = "field_maps"  # key of the case with the names of grids
 MAX_FRAMES = 40
+PRESSURE_MAX = "contact_pressure_max"  # column of path.csv
 
 
 class PicturedRun:
@@ -317,6 +320,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
             yield from figure_files(figure, style, "sensors")
     # of the shell at one point, and of the field around it
     shown_surface = without_zero_fields(surface, run.headline, run.rows)
+    shown_surface = with_contact_errors(shown_surface, run)
     for name, figure in figures(shown_surface, shell_data.h, style, run.camera).items():
         yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
@@ -339,6 +343,28 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
         surfaces, _ = zip(*(run.surface_at(row) for row in solutions), strict=True)
         figure = solutions_figure(surfaces, solutions, shell_data.h, style, run.camera)
         yield from figure_files(figure, style, "solutions")
+
+
+def with_contact_errors(surface: Surface, run: PicturedRun) -> Surface:
+    """Return the surface of a run's headline, with the errors of its contact's numbers."""
+    row, peak = run.headline, surface.contact_peak
+    if peak is None:
+        return surface
+    errors = errors_at_points(run.rows, run.errors).get(int(row["point"]), {})
+    normal_forces = [f"{body}_normal_force" for body in run.resolved.get("bodies") or ()]
+
+    def relative_error(columns: Sequence[str]) -> float:
+        """Return the error of the sum of some columns over the sum; nan if it is not known."""
+        if not columns or any(column not in errors for column in columns):
+            return nan
+        return sum(errors[column] for column in columns) / sum(float(row[c]) for c in columns)
+
+    peak_with_errors = replace(
+        peak,
+        pressure_error=relative_error([PRESSURE_MAX]),
+        force_error=relative_error(normal_forces),
+    )
+    return replace(surface, contact_peak=peak_with_errors)
 
 
 def has_field(row: Row) -> bool:
