@@ -76,12 +76,15 @@ class PressureKeys(CourseKeys, total=False):
         The target: over p_c and R^3, or with a unit.
     on
         Shell or patch -> the side on which the pressure acts.
+    profile
+        Polynomial of the deformed place x, y, z over R that multiplies the pressure.
     """
 
     control: Literal["volume", "load", "arc"]
     pressure: Amount
     volume_change: Amount
     on: Mapping[str, Literal["outside", "inside"]]
+    profile: str
 
 
 class ForceKeys(CourseKeys, total=False):
@@ -132,7 +135,7 @@ class StepKeys(CourseKeys, total=False):
         What is prescribed: the load, what is conjugate to it, or the arc length of the path.
     factor
         Target of "field", "imperfection", "dead", "edge", "source", "interaction", "crease".
-    pressure, volume_change, on
+    pressure, volume_change, on, profile
         Of "pressure", as of `PressureKeys`.
     at, depth, force, patch
         Of "indentation": the point, and as of `ForceKeys`.
@@ -161,6 +164,7 @@ class StepKeys(CourseKeys, total=False):
     pressure: Amount
     volume_change: Amount
     on: Mapping[str, Literal["outside", "inside"]]
+    profile: str
     at: Mapping[str, Any]
     depth: Amount
     force: Amount

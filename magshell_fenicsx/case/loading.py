@@ -152,7 +152,7 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
             )
         # a load, or a pressure that no step applies, can always be held
         load = holdable_loads[name]
-        if holds_conjugate and load is not None:
+        if (holds_conjugate or isinstance(manner, Gas)) and load is not None:
             _refuse_unfit_conjugate(key, load, step)
 
 

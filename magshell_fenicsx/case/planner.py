@@ -873,6 +873,11 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     for contributor, view in context.contributors(last_steps=True):
         if contribution := contributor.contribution(view, modelled):
             loads += contribution
+    if loads.pressure_profile and loads.moves:
+        raise CaseError(
+            "loading: a pressure with a profile: not beside supports that move (kind: edge): what "
+            "it does on the lids that close moving edges is not known"
+        )
     return loads
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
     from magshell_fenicsx.parts.natural.shape import Natural
+    from magshell_fenicsx.parts.pressure.profile import PressureProfile
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Loads:
     pressed_sides
         Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from
         outside.
+    pressure_profile
+        Polynomial of the deformed place that multiplies the live pressure; None for 1.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
     magnetic
@@ -71,6 +74,7 @@ class Loads:
 
     pressure: bool = False
     pressed_sides: Mapping[str, float] = field(default_factory=dict)
+    pressure_profile: "PressureProfile | None" = None
     forces: Mapping[str, Force] = field(default_factory=dict)
     magnetic: "Magnetisation | None" = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)

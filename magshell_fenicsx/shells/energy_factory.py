@@ -74,6 +74,7 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 from magshell_fenicsx.parts.natural.shape import Shape, grown
+from magshell_fenicsx.parts.pressure.profile import PressureProfile
 
 Array = NDArray[np.float64]
 AnyTerm = TypeVar("AnyTerm", bound=FormTerm)
@@ -468,17 +469,20 @@ class EnergyFactory:
         thins = self.material.law.thins_somewhere and field.law == "deformation"
         return self._with_thickness(self._thinning(density) if thins else density)
 
-    def pressure(self, *, potential: bool) -> Energy:
+    def pressure(self, profile: PressureProfile | None, *, potential: bool) -> Energy:
         """Return the energy of a live pressure with the amplitude p/p_c.
 
         With `potential` it is p Delta V. Otherwise the virtual work of a follower load takes the
-        place of the energy's gradient.
+        place of the energy's gradient. A `profile` multiplies p at the deformed place; None for 1.
         """
         # pressure at an amplitude of one: p_c over E h/R
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        swept, follower_work = (
-            self._on_pressed(f) for f in (densities.swept_volume, densities.follower_pressure_work)
+        swept_and_work: tuple[Callable[..., Expr], ...] = (
+            (profile.swept_integral, profile.work)
+            if profile
+            else (densities.swept_volume, densities.follower_pressure_work)
         )
+        swept, follower_work = map(self._on_pressed, swept_and_work)
         parameters = (unit,) if self.pressed_sides is None else (unit, self.pressed_sides)
         density = Density(
             swept, parameters, parts=VALUE_AND_FIRST, work=None if potential else follower_work

@@ -324,7 +324,8 @@ class MeridianModel(ThinModel):
             meridian, self.conditions, loads.pressed_sides
         )
         if loads.pressure:
-            self.energies.append(factory.pressure(potential=not self.without_potential))
+            energy = factory.pressure(loads.pressure_profile, potential=not self.without_potential)
+            self.energies.append(energy)
         return enclosed(loads, free_ends, self.without_potential)
 
     def _add_forces(self) -> None:

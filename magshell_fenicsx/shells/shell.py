@@ -499,7 +499,8 @@ class ShellModel(ThinModel):
         if loads.magnetic:
             terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
-            terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
+            energy = factory.pressure(loads.pressure_profile, potential=not self.without_potential)
+            terms.append(factory.term(energy))
         return terms
 
     def _interaction_term(self) -> "InteractionTerm | None":

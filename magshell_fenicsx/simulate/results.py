@@ -233,7 +233,9 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, result: str) -> 
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Return column -> the amplitude whose conjugate it is, and the unit of this conjugate."""
     model, loads = scene.model, scene.problem.loads
-    amplitudes = {"volume_change": "pressure"} if loads.pressure else {}
+    # none to a pressure that varies with the place
+    has_volume = loads.pressure and not loads.pressure_profile
+    amplitudes = {"volume_change": "pressure"} if has_volume else {}
     amplitudes |= {
         column: name
         for observables in OBSERVABLES

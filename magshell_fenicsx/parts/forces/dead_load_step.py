@@ -252,8 +252,8 @@ class DeadSection(PathStep):
             return (
                 f"{context.step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the "
                 "material and along the undeformed normal; a live one, as of a fluid, turns with "
-                "the surface (a ring buckles at 3/4 of the dead one) and is the same everywhere: "
-                "kind: pressure"
+                "the surface (a ring buckles at 3/4 of the dead one): kind: pressure, with a "
+                "profile where it varies"
             )
         return None
 

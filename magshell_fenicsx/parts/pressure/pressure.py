@@ -10,10 +10,11 @@ view is a model with the units in which it is reported. Volumes are over R^3, h 
 from dataclasses import dataclass, replace
 from functools import partial
 from math import copysign, cos, pi, radians, sqrt
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
+from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.ability import Account, Context, Modelled
@@ -38,6 +39,8 @@ from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch
 INFLATION_STEP_FACTOR = 10.0  # of the largest step of blown-up rubber, times E h/R over p_c
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from magshell_fenicsx.continuation.device import Conjugate
     from magshell_fenicsx.continuation.point import StepOptions
     from magshell_fenicsx.continuation.system import State
@@ -50,7 +53,6 @@ class PressureSection(PathStep):
     """Live pressure, which follows the surface; p > 0 from outside."""
 
     amplitude: ClassVar[str] = "pressure"
-    conjugate: ClassVar[str] = "volume"
     conjugate_control: ClassVar[str] = "volume"
     divides_whole_way: ClassVar[bool] = False
     targets: ClassVar[dict[str, Target]] = {
@@ -69,15 +71,59 @@ class PressureSection(PathStep):
     on: dict[str, Literal["outside", "inside"]] | None = Field(default=None, min_length=1)
     """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by
     default all from outside. ΔV is then the volume that these sweep"""
+    profile: Formula | None = None
+    """Polynomial of the deformed place x, y, z over R that multiplies p, as the depth of a fluid,
+    "1 - z"; with control: load or arc, since no ΔV is conjugate to p then. Its potential is the
+    integral of p over the volume swept"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _control_of_a_profile(cls, data: Any) -> Any:
+        """Choose the arc length for a profile, if the case gives neither control nor a pressure."""
+        keys = set(data) if isinstance(data, dict) else set()
+        chooses = "profile" in keys and not keys & {"control", "pressure"}
+        return {**data, "control": "arc"} if chooses else data
+
+    @field_validator("profile")
+    @classmethod
+    def _profile_has_a_potential(cls, profile: str | None) -> str | None:
+        """Refuse a profile that is no polynomial of a low degree."""
+        from magshell_fenicsx.parts.pressure.profile import MAX_DEGREE, polynomial_degree
+
+        degree = 0 if profile is None else polynomial_degree(profile)
+        if degree is None or not 0 <= degree <= MAX_DEGREE:
+            raise ValueError(
+                f"{profile!r}: allowed are polynomials of x, y, z up to degree {MAX_DEGREE}, "
+                "not zero, whose integral over the volume swept is exact"
+            )
+        return profile
+
+    @model_validator(mode="after")
+    def _no_volume_of_a_profile(self) -> Self:
+        """Refuse a change of volume as control or target of a pressure with a profile."""
+        by_volume = self.control == "volume" or self.volume_change is not None
+        if self.profile is not None and by_volume:
+            raise ValueError(
+                "profile: no change of volume is conjugate to a pressure that varies: take "
+                "control: load or arc, and a target pressure"
+            )
+        return self
+
+    @property
+    def conjugate(self) -> str:  # type: ignore[override]  # a pressure that varies has none
+        return "volume" if self.profile is None else ""
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse `on` without several shells or patches, or with another pressure elsewhere.
+        """Refuse `on` without several shells or patches, and two pressures that are not alike.
 
         Raises
         ------
         ValueError
             With the key of the step.
         """
+        pressures = [s.load for s in context.steps if isinstance(s.load, PressureSection)]
+        if self.profile is not None:
+            self._refuse_unfit_profile(context, pressures)
         if self.on is None:
             return
         if context.solid or not isinstance(context.shell, MeshSurface):
@@ -85,31 +131,59 @@ class PressureSection(PathStep):
                 f"{context.step.key}.on: names one of several shells, or a patch of a mesh file: "
                 "leave it out"
             )
-        loads = [other.load for other in context.steps]
-        if any(
-            isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads
-        ):
+        if any(load.on not in (None, self.on) for load in pressures):
             raise ValueError(
                 f"{context.step.key}.on: another step has a pressure elsewhere: there is one, on "
                 "the same shells"
             )
 
+    def _refuse_unfit_profile(
+        self, context: Context, pressures: "Sequence[PressureSection]"
+    ) -> None:
+        """Refuse a profile on a solid, or beside a pressure with another one.
+
+        Parameters
+        ----------
+        pressures
+            All pressures of the programme.
+        """
+        key = f"{context.step.key}.profile"
+        if context.solid:
+            raise ValueError(f"{key}: needs a mid-surface: take model: shell")
+        if any(load.profile != self.profile for load in pressures):
+            raise ValueError(
+                f"{key}: another step has a pressure with another profile: there is one: give "
+                "both steps the same"
+            )
+
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the symmetry that a pressure on some patches preserves."""
+        """Return the symmetry that a pressure on some patches, and its profile, preserve."""
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
-        return [
+        constraints = [
             *super().symmetry_constraints(context, outline),
             patch_constraint(f"{context.step.key}.on", self.on or (), assembly),
         ]
+        if self.profile is not None:
+            from magshell_fenicsx.parts.pressure.profile import PressureProfile
+
+            term = PressureProfile(self.profile).energy_term("pressure")
+            constraints.append(term.symmetry_constraint(outline))
+        return constraints
 
     def contribution(self, context: Context, modelled: Modelled) -> "Loads":
-        """Return the faces that are pressed."""
-        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
+        """Return the faces that are pressed, and the profile of the pressure."""
+        # the solver takes long to import
+        from magshell_fenicsx.parts.loads import Loads
+        from magshell_fenicsx.parts.pressure.profile import PressureProfile
 
         sides = {"outside": 1.0, "inside": -1.0}
-        return Loads(pressed_sides={name: sides[face] for name, face in (self.on or {}).items()})
+        profile = None if self.profile is None else PressureProfile(self.profile, modelled.turn)
+        return Loads(
+            pressed_sides={name: sides[face] for name, face in (self.on or {}).items()},
+            pressure_profile=profile,
+        )
 
     def course(self, step_start: StepStart) -> StepCourse:
         """Return the course of the step, by arc length where the pressure has no potential.
@@ -131,7 +205,13 @@ class PressureSection(PathStep):
     def on_perfect(self, *, last: bool) -> Step:
         """Return this step for the perfect shell; the last one goes to the first instability."""
         return (
-            PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on)
+            PressureSection(
+                kind="pressure",
+                control=self.control,
+                hold=self.hold,
+                on=self.on,
+                profile=self.profile,
+            )
             if last
             else self
         )
@@ -182,7 +262,9 @@ class PressureObservables(Observables):
             f"{name} from {'outside' if side > 0 else 'inside'}"
             for name, side in loads.pressed_sides.items()
         )
-        return Account([f"live pressure{faces and f' on {faces}'}"])
+        profile = loads.pressure_profile
+        varying = f", times {profile.text} at the deformed place" if profile else ""
+        return Account([f"live pressure{faces and f' on {faces}'}{varying}"])
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """Return -dPi/dmu of one unit of the change of volume, R^3; None of other amplitudes."""
