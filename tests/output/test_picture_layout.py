@@ -51,7 +51,7 @@ def test_numbers_cover_no_other_numbers_and_no_marks() -> None:
     axes = figure.subplots()
     x = np.concatenate([np.linspace(0, 0.1, 20), np.linspace(0.15, 1, 20)])
     axes.plot(x, 1 / (1 + 20 * x), "o", markersize=4.5)
-    marks = [((float(v), float(1 / (1 + 20 * v))), str(i)) for i, v in enumerate(x, 1)]
+    marks = [((float(v), float(1 / (1 + 20 * v))), i) for i, v in enumerate(x, 1)]
     write_numbers(axes, marks, [np.array([x, 1 / (1 + 20 * x)])])
     renderer = FigureCanvasAgg(figure).get_renderer()
     boxes = [

@@ -14,7 +14,7 @@ from PIL import Image
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.pictures.curve import curve_figure, worth_drawing
+from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_panels, worth_drawing
 from magshell_fenicsx.output.pictures.curve_additions import (
     _cropped,
     _free_corner,
@@ -278,9 +278,9 @@ def test_shells_on_a_curve(run: Path, tmp_path: Path) -> None:
     last = len(read_rows(again / "path.csv")) - 1
     drawn = PicturedRun(again)
     figure = curve_figure(drawn.rows, "pressure", drawn.style)
-    parts = worth_drawing(curve_steps(drawn.rows, "pressure"))
+    panels = drawn_panels(drawn.rows, "pressure")
     shown = [(drawn.rows[i], drawn.surface_at(drawn.rows[i])[0]) for i in (2, last)]
-    add_shapes(figure, parts, shown, drawn.style, drawn.camera)
+    add_shapes(figure, panels, shown, 0.01, drawn.camera)
     figure.draw_without_rendering()
     boxes = [each.offsetbox.get_window_extent() for each in figure.axes[0].artists]
     assert len(boxes) == 2

@@ -19,7 +19,12 @@ from magshell_fenicsx.output.pictures.bodies_and_magnets import near_places
 from magshell_fenicsx.output.pictures.colours import ColouredField
 from magshell_fenicsx.output.pictures.curve import plot_curve
 from magshell_fenicsx.output.pictures.layout import FigureBoxes, Panel, directions, drawing
-from magshell_fenicsx.output.pictures.lines import CurveStep, curve_coordinates, curve_steps
+from magshell_fenicsx.output.pictures.lines import (
+    CurveStep,
+    curve_coordinates,
+    curve_panels,
+    curve_steps,
+)
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
 from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
@@ -37,6 +42,7 @@ DURATION = 6.0  # s, of all frames
 DURATION_OF_LAST = 1500  # ms, of the last frame
 MIN_FRAME_DURATION = 80  # ms
 MAX_CURVES = 4  # above each other
+MIN_CURVE_HEIGHT = 230  # pixels of a curve with its labels
 COLOURS = 128  # half of the palette
 STYLE = OutputSection(dpi=120, font_size=9)
 WHITE = (255, 255, 255)
@@ -217,7 +223,11 @@ def _composed(
 
     # from the left: shell, bar of colours, curves; the title above takes 40 pixels
     shell_height, shell_width = views[0].image.shape[:2]
-    width, height = shell_width + 600, max(shell_height + 40 + FOOT, 400)
+    panels = list[list[CurveStep]]()
+    if rows[-1]["amplitude"]:
+        panels = curve_panels(curve_steps(rows, str(rows[-1]["amplitude"])))[-MAX_CURVES:]
+    height = max(shell_height + 40 + FOOT, 400, 70 + MIN_CURVE_HEIGHT * len(panels))
+    width = shell_width + 600
     shell_low = FOOT + (height - 40 - FOOT - shell_height) // 2
     figure = Figure(figsize=(width / STYLE.dpi, height / STYLE.dpi), dpi=STYLE.dpi)
     boxes = FigureBoxes(figure)
@@ -230,7 +240,7 @@ def _composed(
     colour_bar(figure, box(shell_width + 30, 90, 16, height - 180), views[0].scale, "vertical")
     figure.text(15 / width, 12 / height, _scale(factor))
     directions(box(shell_width - 60, 4, 70, 70), views[0].camera, STYLE)
-    markers = _draw_curves(box, shell_width + 230, height, rows, pole)
+    markers = _draw_curves(box, shell_width + 230, height, panels, pole)
     # artists that are "animated" are left out of the fixed parts
     title = figure.text(15 / width, 1 - 12 / height, "", va="top", animated=True)
     canvas.draw()
@@ -254,10 +264,10 @@ def _draw_curves(
     box: "Callable[[float, float, float, float], Axes]",
     left: float,
     height: float,
-    rows: Sequence[Row],
+    panels: Sequence[Sequence[CurveStep]],
     pole: str,
-) -> "dict[int, tuple[Axes, CurveStep, Line2D]]":
-    """Draw the curves of the last steps above each other, and return where points have markers.
+) -> "dict[int, tuple[Axes, str, Line2D]]":
+    """Draw the curves of panels above each other, and return where points have markers.
 
     Parameters
     ----------
@@ -265,31 +275,29 @@ def _draw_curves(
         Function from left, low, width and height of a box in pixels to axes in it.
     left, height
         Left side of the axes, and height of the figure, in pixels.
-    rows
-        All rows of the path.
+    panels
+        The steps in each panel, from above.
     pole
         Name of the point of w_pole_over_h in a case without named points.
 
     Returns
     -------
-    Number of a point -> axes, step and marker of its curve. Markers have no places yet.
+    Number of a point -> axes, amplitude and marker of its curve. Markers have no places yet.
     """
-    steps = list[CurveStep]()
-    if rows[-1]["amplitude"]:
-        steps = curve_steps(rows, str(rows[-1]["amplitude"]))[-MAX_CURVES:]
-    height_of_curve = (height - 70) // max(len(steps), 1)
-    markers: dict[int, tuple[Axes, CurveStep, Line2D]] = {}
-    for i, step in enumerate(reversed(steps)):  # from below
+    height_of_curve = (height - 70) // max(len(panels), 1)
+    markers: dict[int, tuple[Axes, str, Line2D]] = {}
+    for i, steps in enumerate(reversed(panels)):  # from below
         axes = box(left, 70 + i * height_of_curve, 350, height_of_curve - 70)
-        plot_curve(axes, step, pole)
+        plot_curve(axes, steps, pole)
         (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
-        markers |= {int(row["point"]): (axes, step, marker) for row in step.rows}
+        place = axes, steps[0].amplitude, marker
+        markers |= {int(row["point"]): place for step in steps for row in step.rows}
     return markers
 
 
-def _draw_marker(axes: "Axes", step: CurveStep, marker: "Line2D", row: Row) -> None:
+def _draw_marker(axes: "Axes", amplitude: str, marker: "Line2D", row: Row) -> None:
     """Draw the marker of a curve at a row of path.csv on the canvas."""
-    x, y = curve_coordinates(row, step.amplitude)
+    x, y = curve_coordinates(row, amplitude)
     marker.set_data([x], [y])
     axes.draw_artist(marker)
 

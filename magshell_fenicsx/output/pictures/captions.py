@@ -8,6 +8,7 @@ length and Poisson's ratio.
 
 from collections.abc import Iterable, Sequence
 from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,7 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 DIGIT_WIDTH, DIGIT_HEIGHT = 0.6, 0.95  # over the size of the font
+TEXT_DISTANCE = 0.3  # between two texts beside each other, over the size of the font
 MARK_DISTANCE = 4.0  # between a mark and its number, in points
 # columns of captions beside the fields, where they are not zero
 CAPTION_COLUMNS = ("field_angle", "p_over_pc", "force", "load_factor", "time")
@@ -32,16 +34,17 @@ HALF_MARK = 3.0  # half the size of a mark, in points
 
 
 def write_numbers(
-    axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]], curves: Sequence[Array]
+    axes: "Axes", marks: Sequence[tuple[tuple[float, float], int]], curves: Sequence[Array]
 ) -> None:
-    """Write texts beside marks at places of the data, such as the numbers of instabilities.
+    """Write numbers beside marks at places of the data, such as the numbers of instabilities.
 
-    Texts that would cover other texts or marks are left out.
+    Marks that cover each other have one text. Texts that would cover other texts or marks are left
+    out.
 
     Parameters
     ----------
     marks
-        Places in the data, and texts.
+        Places in the data, and numbers.
     curves
         Places (2, n) that a number had better not cover.
     """
@@ -63,18 +66,21 @@ def write_numbers(
 
     places_of_marks = in_points(np.array([place for place, _ in marks], float))
     points_of_curves = (
-        np.concatenate([in_points(curve.T) for curve in curves]) if curves else np.zeros((0, 2))
+        np.concatenate([_dense(in_points(curve.T)) for curve in curves])
+        if curves
+        else np.zeros((0, 2))
     )
     # boxes (middle, half of the size) that texts must not cover: marks, later texts too
     occupied = [(place, np.full(2, HALF_MARK)) for place in places_of_marks]
-    for i, (_, text) in enumerate(marks):
+    for i, group in groups_of_places(places_of_marks, 2 * HALF_MARK).items():
+        text = number_ranges([marks[k][1] for k in group])
         half_size = np.array([DIGIT_WIDTH * len(text), DIGIT_HEIGHT]) * font_size / 2
         middle = _best_middle(
             i, half_size, places_of_marks, points_of_curves, occupied=occupied, extent=extent
         )
         if middle is None:  # no room for this text
             continue
-        occupied.append((middle, half_size))
+        occupied.append((middle, half_size + np.array([TEXT_DISTANCE * font_size, 0.0])))
         axes.text(
             middle[0] / extent[0],
             middle[1] / extent[1],
@@ -83,6 +89,49 @@ def write_numbers(
             ha="center",
             va="center",
         )
+
+
+def _dense(line: Array) -> Array:
+    """Return places at most one point apart along a line (n, 2)."""
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+    positions = np.linspace(0, lengths[-1], int(lengths[-1]) + 2)
+    return np.column_stack([np.interp(positions, lengths, values) for values in line.T])
+
+
+def groups_of_places(places: Array, distance: float) -> dict[int, list[int]]:
+    """Return number of a place -> numbers of all places (n, 2) nearer to it than a distance.
+
+    Each place is in one group, the first one that it is near to.
+
+    Examples
+    --------
+    >>> groups_of_places(np.array([[0.0, 0], [5, 0], [1, 0]]), 2.0)
+    {0: [0, 2], 1: [1]}
+    """
+    groups = dict[int, list[int]]()
+    for i, place in enumerate(places):
+        near = (k for k in groups if np.linalg.norm(places[k] - place) < distance)
+        groups.setdefault(next(near, i), []).append(i)
+    return groups
+
+
+def number_ranges(numbers: Sequence[int]) -> str:
+    """Return different whole numbers as text, three or more successive ones as a range.
+
+    Examples
+    --------
+    >>> number_ranges([7, 1, 2, 3]), number_ranges([4, 5])
+    ('1–3, 7', '4, 5')
+    """
+    texts = list[str]()
+    # successive numbers have one distance from their rank
+    for _, group in groupby(enumerate(sorted(set(numbers))), key=lambda item: item[1] - item[0]):
+        successive = [number for _, number in group]
+        if len(successive) > 2:
+            texts.append(f"{successive[0]}–{successive[-1]}")
+        else:
+            texts += map(str, successive)
+    return ", ".join(texts)
 
 
 def _best_middle(

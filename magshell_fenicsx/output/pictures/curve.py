@@ -33,7 +33,9 @@ from magshell_fenicsx.output.pictures.lines import (
     Line,
     axes_for,
     curve_coordinates,
+    curve_panels,
     curve_steps,
+    curve_title,
     is_unstable,
     line_coordinates,
     load_axis,
@@ -43,6 +45,7 @@ from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
 from magshell_fenicsx.quantities.mode_labels import TORSION
+from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import shown_quantity
 
@@ -60,6 +63,7 @@ HIDDEN_SIZE = 12.0  # points: a smaller unstable part is hidden by the marks at 
 INSET_MARGIN = 0.8  # around such a part in its inset, over its size
 WIDTH_TOLERANCE = 1e-9  # over the widest curve of the same kind: a narrower curve is noise
 STRAIGHTNESS_TOLERANCE = 0.005  # distance from the chord over the extent, of a straight line
+ARROW_LENGTH, MIN_LENGTH_OF_WAY = 8.0, 24.0  # pixels: of an arrow, and of a step with an arrow
 INSET_SIZE = 0.4  # of the axes
 INSET_GAP = 0.14  # of the axes: room for the numbers of the inset
 MAX_COVERED = 0.02  # of the points of all curves, that an inset may cover
@@ -74,8 +78,9 @@ def curve_figure(
 ) -> "Figure":
     """Return the figure of the part of a path in which `amplitude` varied, with its branches.
 
-    Instabilities are marked and numbered. Of a programme each step is drawn, the last one largest;
-    earlier steps that are a single straight line are left out. Stable parts are solid, unstable
+    Instabilities are marked and numbered. Of a programme each step is drawn; steps over the same
+    quantities are in one panel, with arrows along their way. The last panel is largest; earlier
+    ones with a single straight line are left out. Stable parts are solid, unstable
     parts dashed. An unstable part that its marks would hide is drawn again in an inset. A
     user-defined amplitude is drawn over the displacement of the pole.
 
@@ -89,42 +94,54 @@ def curve_figure(
         Estimated errors by the name of the result, as in summary.json; a band shows them where it
         is wider than the line.
     """
-    steps = worth_drawing(curve_steps(rows, amplitude))
+    panels = drawn_panels(rows, amplitude)
     with drawing(style):
-        figure, cells = _figure_with_cells(steps, style)
-        for cell, step in zip(cells, steps, strict=True):
+        figure, cells = _figure_with_cells(panels, style)
+        for cell, steps in zip(cells, panels, strict=True):
             axes = figure.add_subplot(cell)
-            plot_curve(axes, step, pole)
-            axes.set_title(step.title)
-        legend(figure, max_columns=4 * min(len(steps), 2))
+            plot_curve(axes, steps, pole)
+            axes.set_title(curve_title(steps))
+        legend(figure, max_columns=4 * min(len(panels), 2))
         place_axes(figure)  # for insets
         errors_of_points = errors_at_points(rows, errors or {})
-        for axes, step in zip(list(figure.axes), steps, strict=True):
-            draw_hidden(axes, step)
-            draw_error_band(axes, step, errors_of_points)
+        for axes, steps in zip(list(figure.axes), panels, strict=True):
+            draw_hidden(axes, steps)
+            for step in steps:
+                draw_error_band(axes, step, errors_of_points)
     return figure
 
 
-def _figure_with_cells(
-    steps: Sequence[CurveStep], style: OutputSection
-) -> tuple["Figure", list[Any]]:
-    """Return an empty figure, and matplotlib's cell of its grid for the axes of each step.
+def drawn_panels(rows: Sequence[Row], amplitude: str) -> list[list[CurveStep]]:
+    """Return the steps in each panel of the picture of a path in which `amplitude` varied last."""
+    steps = curve_steps(rows, amplitude)
+    bent_steps = worth_drawing(steps)
+    return [
+        panel
+        for panel in curve_panels(steps)
+        if any(step is bent for step in panel for bent in bent_steps)
+    ]
 
-    The last step spans a whole row below the others if it is a motion, or if there are three steps
-    or more. Otherwise all steps are in one row. Lengths in the code are in inches.
+
+def _figure_with_cells(
+    panels: Sequence[Sequence[CurveStep]], style: OutputSection
+) -> tuple["Figure", list[Any]]:
+    """Return an empty figure, and matplotlib's cell of its grid for the axes of each panel.
+
+    The last panel spans a whole row below the others if it is a motion, or if there are three
+    panels or more. Otherwise all are in one row. Lengths in the code are in inches.
     """
     from matplotlib.figure import Figure
 
-    last_number = len(steps) - 1
-    last_is_wide = steps[-1].amplitude == "time" or len(steps) > 2
-    width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
-    # rows of small axes, and the last row, which is all if the last step is not wide
+    last_number = len(panels) - 1
+    last_is_wide = panels[-1][0].amplitude == "time" or len(panels) > 2
+    width = (style.width or (ONE_COLUMN if len(panels) == 1 else TWO_COLUMNS)) / INCH
+    # rows of small axes, and the last row, which is all if the last panel is not wide
     if last_is_wide and last_number:
         columns = min(last_number, 3)
         small_row_count = -(-last_number // columns)  # rounded up
         last_height = 0.45 * width  # wider than the others, so lower over its width
     else:
-        columns, small_row_count = len(steps), 0
+        columns, small_row_count = len(panels), 0
         last_height = width * (0.75 / columns)
     small_height = 0.75 * width / max(columns, 2)
     figure = Figure(
@@ -207,24 +224,25 @@ def legend(figure: "Figure", max_columns: int) -> None:
         )
 
 
-def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
-    """Draw a step of a path in given axes: curve, instabilities, solutions, numbers and labels.
+def plot_curve(axes: "Axes", steps: Sequence[CurveStep], pole: str = POLE) -> None:
+    """Draw steps of a path in given axes: curves, instabilities, solutions, numbers and labels.
 
-    `pole` names the point of w_pole_over_h in a case without named points.
+    Several steps have arrows along their way. `pole` names the point of w_pole_over_h in a case
+    without named points.
     """
+    amplitude, first_row = steps[0].amplitude, steps[0].rows[0]
     x_label, y_label = (
-        with_point_name(axis_quantity, step.rows[0], pole, r"\$").label
-        for axis_quantity in axes_for(step)
+        axis_label(axis_quantity, first_row, pole) for axis_quantity in axes_for(steps[0])
     )
-    curves = draw_lines(axes, step)
-    instabilities = [row for row in step.rows if row["label"] in LOCATED]
-    solutions = [row for row in step.rows if row["label"] == SOLUTION]
+    curves = [curve for step in steps for curve in draw_lines(axes, step)]
+    rows = [row for step in steps for row in step.rows]
+    solutions = [row for row in rows if row["label"] == SOLUTION]
     # squares at solutions, filled if they are stable
     for row in solutions:
         name, fill = ("unstable", "none") if is_unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
         axes.plot(
-            *curve_coordinates(row, step.amplitude),
+            *curve_coordinates(row, amplitude),
             "s",
             color="C2",
             markerfacecolor=fill,
@@ -233,20 +251,68 @@ def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
         )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
+    axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)  # it may move the limits
     # numbers of instabilities along the path, and of the solutions of searches
-    texts = [str(step.numbers[int(row["point"])]) for row in instabilities]
-    texts += [str(row["branch"]) for row in solutions]
-    places = [curve_coordinates(row, step.amplitude) for row in (*instabilities, *solutions)]
-    write_numbers(axes, list(zip(places, texts, strict=True)), curves)
+    numbers = {  # of a point: a step begins at a row of the step before
+        int(row["point"]): (row, step.numbers[int(row["point"])])
+        for step in steps
+        for row in step.rows
+        if row["label"] in LOCATED
+    }
+    marks = [(curve_coordinates(row, amplitude), number) for row, number in numbers.values()]
+    marks += [(curve_coordinates(row, amplitude), int(row["branch"])) for row in solutions]
+    write_numbers(axes, marks, curves)
     is_narrow = axes.get_position().width <= NARROW_AXES
     axes.locator_params(axis="x", nbins=3 if is_narrow else 6)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(number_format())
-    axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    has_unstable = any(is_unstable(row) for row in step.rows if row["label"] != SOLUTION)
-    if instabilities and has_unstable:  # empty lines, for the legend
+    if len(steps) > 1:
+        for step in steps:
+            _draw_direction(axes, step)
+    has_unstable = any(line.is_dashed() for line in axes.lines)
+    if numbers and has_unstable:  # empty lines, for the legend
         axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
+
+
+def axis_label(axis_quantity: Quantity, row: Row, pole: str = POLE) -> str:
+    """Return the label of an axis, with the unit of a time that has no seconds.
+
+    Parameters
+    ----------
+    axis_quantity
+        The quantity of the axis.
+    row
+        A row of path.csv, which names the case's points.
+    pole
+        Name of the point of w_pole_over_h in a case without named points.
+    """
+    label = with_point_name(axis_quantity, row, pole, r"\$").label
+    return rf"{label}  ($R\sqrt{{\rho/E}}$)" if axis_quantity.name == "time" else label
+
+
+def _draw_direction(axes: "Axes", step: CurveStep) -> None:
+    """Draw an arrowhead in the middle of the main line of a step, along its way."""
+    main_line = line_coordinates(step)[0]
+    places = [curve_coordinates(row, step.amplitude) for row in main_line.rows]
+    curve = main_line.smooth_curve(*zip(*places, strict=True), load_axis=load_axis(step.amplitude))
+    pixels = axes.transData.transform(curve.T)
+    length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1)))
+    # from a little before the middle of the way to a little behind it
+    places = length[-1] / 2 + ARROW_LENGTH * np.array([-0.5, 0.5])
+    (x, next_x), (y, next_y) = (np.interp(places, length, values) for values in curve)
+    if length[-1] > MIN_LENGTH_OF_WAY:
+        axes.annotate(
+            "",
+            (next_x, next_y),
+            (x, y),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=0.7,head_width=0.25",
+                "color": "C0",
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+        )
 
 
 def draw_lines(
@@ -375,18 +441,20 @@ def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
     return None
 
 
-def draw_hidden(axes: "Axes", step: CurveStep) -> None:
-    """Draw in an inset the unstable part that its marks hide; do nothing if none is hidden.
+def draw_hidden(axes: "Axes", steps: Sequence[CurveStep]) -> None:
+    """Draw in an inset the first unstable part that its marks hide; do nothing if none is hidden.
 
     The inset is in the corner with the fewest points of the curves. It is left out where all
     corners are covered.
     """
-    if (box := hidden_box(axes, step)) is None:
+    boxes = (hidden_box(axes, step) for step in steps)
+    if (box := next((box for box in boxes if box is not None), None)) is None:
         return
     if (corner := _corner_of_inset(axes)) is None:
         return
     inset = axes.inset_axes((*corner, INSET_SIZE, INSET_SIZE))
-    draw_lines(inset, step)
+    for step in steps:
+        draw_lines(inset, step)
     inset.set(xlim=box[:, 0], ylim=box[:, 1])
     inset.tick_params(labelsize="x-small", length=2)
     inset.locator_params(nbins=3)

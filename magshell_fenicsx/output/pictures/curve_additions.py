@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.animation import edge_of, magnification
+from magshell_fenicsx.output.pictures.animation import STYLE, edge_of, magnification
+from magshell_fenicsx.output.pictures.colours import ColouredField
 from magshell_fenicsx.output.pictures.curve import MARK_SIZE, draw_lines, drawn_points, legend
 from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, drawing, place_axes
 from magshell_fenicsx.output.pictures.lines import (
@@ -28,7 +29,7 @@ from magshell_fenicsx.output.pictures.lines import (
 )
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
-from magshell_fenicsx.output.pictures.scales import number_format
+from magshell_fenicsx.output.pictures.scales import SIGNED, from_zero, number_format, numbers
 from magshell_fenicsx.output.store.stored_results import case_in, pole_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
@@ -41,7 +42,6 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 MAX_KEYS = 2  # of a case in the label of its run
 MAX_WIDTH, MAX_HEIGHT = 0.26, 0.34  # of a shell on a curve, over the axes
-GREY = 0.8
 EDGE_GREY, EDGE_OPACITY = 0.3, 0.8  # of the line around a shell
 PLACES_PER_SIDE = 9  # that are tried for a shell
 MARGIN = 0.02  # around these places, over the axes
@@ -178,55 +178,67 @@ def _value_words(value: Any) -> str:
     return str(value).replace("$", r"\$")
 
 
-def _last_curve_with(row: Row, steps: Sequence[CurveStep]) -> int | None:
-    """Return the number of the last curve that has a row; None if no curve has it."""
-    return next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
+def _last_panel_with(row: Row, panels: Sequence[Sequence[CurveStep]]) -> int | None:
+    """Return the number of the last panel with a row; None if no panel has it."""
+    numbers = range(len(panels) - 1, -1, -1)
+    return next((i for i in numbers if any(row in step.rows for step in panels[i])), None)
 
 
 def add_shapes(
     figure: "Figure",
-    steps: Sequence[CurveStep],
+    panels: Sequence[Sequence[CurveStep]],
     shapes: Sequence[tuple[Row, Surface]],
-    style: OutputSection,
+    h: float,
     camera: Camera,
 ) -> None:
     """Draw the shell at some points on the curves of a figure, with a line from each to its point.
 
-    Each shell is where it covers least. All are of one scale. Displacements too small to be seen
-    are magnified, and the title says so.
+    Each shell is where it covers least. All are of one scale, coloured by their own w/h. The title
+    has the range of colours, and the factor of displacements that are too small to be seen.
 
     Parameters
     ----------
-    figure, steps
-        Figure with one curve for each step, in this order.
+    figure, panels
+        Figure with curves, and the steps that are drawn in each of its axes.
     shapes
         Row of path.csv of each point, and the deformed shell there.
-    style
-        Not used here.
+    h
+        Thickness over R.
     camera
         Projection of all shells.
     """
-    curve_numbers = [_last_curve_with(row, steps) for row, _ in shapes]
+    panel_numbers = [_last_panel_with(row, panels) for row, _ in shapes]
     # one factor for the displacements of all shapes; it is in the titles
     factor = magnification([surface for _, surface in shapes])
     magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]
-    if factor > 1:
-        for curve_number in dict.fromkeys(i for i in curve_numbers if i is not None):
-            axes = figure.axes[curve_number]
-            title = f"{axes.get_title()}; " if axes.get_title() else ""
-            axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
+    limits = from_zero(
+        min(float(surface.w.min()) for _, surface in shapes) / h,
+        max(float(surface.w.max()) for _, surface in shapes) / h,
+    )
+    fields = [
+        ColouredField("", np.asarray(surface.w / h), limits, SIGNED, "") for _, surface in shapes
+    ]
+    texts, _ = numbers([*limits])
+    colours = [f"{text} {colour}" for text, colour in zip(texts, ("blue", "red"), strict=True)]
+    words = f"shapes: $w/h$ = 0 white, {', '.join(text for text in colours if text[:2] != '0 ')}"
+    words += f"\ndisplacements of shapes $\\times$ {factor:g}" if factor > 1 else ""
+    for panel_number in dict.fromkeys(i for i in panel_numbers if i is not None):
+        axes = figure.axes[panel_number]
+        axes.set_title("\n".join(text for text in (axes.get_title(), words) if text))
     place_axes(figure)  # shapes are drawn to the sizes of the axes
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
-    occupied = dict[int, list[Array]]()  # number of a curve -> boxes of the shapes drawn so far
-    for number, (row, _), surface in zip(curve_numbers, shapes, magnified, strict=True):
+    occupied = dict[int, list[Array]]()  # number of a panel -> boxes of the shapes drawn so far
+    for number, (row, _), surface, field in zip(
+        panel_numbers, shapes, magnified, fields, strict=True
+    ):
         if number is None:
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
-        image = _shell_image(surface, camera, places, (box.width, box.height))
+        image = _shell_image(surface, field, camera, places, (box.width, box.height))
         # its place near the point of the curve, where other shapes are not
         size_over_axes = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
-        point = np.array(curve_coordinates(row, steps[number].amplitude))
+        point = np.array(curve_coordinates(row, panels[number][0].amplitude))
         corner = _free_corner(axes, point, size_over_axes, occupied.setdefault(number, []))
         occupied[number].append(np.array([corner, corner + size_over_axes]))
         _add_shape(axes, image, point, corner, size_over_axes)
@@ -235,9 +247,13 @@ def add_shapes(
 
 
 def _shell_image(
-    surface: Surface, camera: Camera, places: Array, axes_size: tuple[float, float]
+    surface: Surface,
+    field: ColouredField,
+    camera: Camera,
+    places: Array,
+    axes_size: tuple[float, float],
 ) -> Image:
-    """Return the image of a shell in grey, as large as there is room for it in the axes.
+    """Return the image of a shell in colours, as large as there is room for it in the axes.
 
     Parameters
     ----------
@@ -253,7 +269,8 @@ def _shell_image(
     room = min(MAX_WIDTH * axes_width, MAX_HEIGHT * axes_height / height_over_width)
     width = max(int(room), 8)
     window = Window.around(places, width)
-    return _cropped(Background(surface, camera, width, window).grey_image(GREY))
+    view = Background(surface, camera, width, window)
+    return _cropped(view.panel(field, STYLE).image)
 
 
 def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Array) -> None:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.tessellation import tessellate
 from magshell_fenicsx.output.pictures.layout import INCH, ONE_COLUMN, TWO_COLUMNS, columns, drawing
 from magshell_fenicsx.output.pictures.readings import unit_of
 from magshell_fenicsx.output.pictures.scales import number_format
+from magshell_fenicsx.output.pictures.sections import plane_section
 from magshell_fenicsx.parts.observables import MapGrid
 from magshell_fenicsx.problem.requests import OutputSection
 
@@ -36,7 +36,6 @@ MIN_IN_PLANE_PART = 1e-6  # of |B|: a smaller part in the plane has no lines
 MARGIN = 1.5  # inches of a panel above and below its map: title, axis, colours
 MAP_WIDTH, MAX_MAP_HEIGHT = 0.78, 2.0  # over a panel's width
 PARALLEL = 1 - 1e-12  # least cosine of parallel directions
-PLANE_TOLERANCE = 1e-9  # over R: distance of places on a plane
 LINE_DENSITY = 1.2  # of field lines, as matplotlib counts it
 LENGTH_TOLERANCE = 1e-7  # relative: a line without length, where a corner is on the plane
 LINE_WIDTH = 0.6  # points: around the section of the shell, whose thickness is true
@@ -99,33 +98,8 @@ def plane_of(grid: MapGrid) -> MapGrid:
 
 
 def section(surface: Surface, grid: MapGrid) -> Array:
-    """Return the lines (n, 2, 3) over R in which a deformed surface meets the plane of a grid.
-
-    Each line lies in one triangle. The surface is the mid-surface of a shell, or the surface of a
-    solid.
-    """
-    tessellation = tessellate(surface)
-    places = tessellation.at_points(surface.r0 + surface.u)
-    normal = np.cross(*grid.sides)
-    height = (places - grid.corner) @ (normal / np.linalg.norm(normal))
-    # places on the plane are on one side of it, in all cells
-    height = np.where(np.abs(height) < PLANE_TOLERANCE, PLANE_TOLERANCE, height)
-    corners, heights = places[tessellation.triangles], height[tessellation.triangles]
-    crossed = np.abs(np.sign(heights).sum(axis=1)) < 3  # whether corners are on both sides
-    corners, heights = corners[crossed], heights[crossed]
-    # the corner that is alone on its side of the plane: the lowest one if two are above
-    two_are_above = np.sign(heights).sum(axis=1) > 0
-    single_corner = np.where(two_are_above, heights.argmin(axis=1), heights.argmax(axis=1))
-    rows = np.arange(len(corners))
-    single_place, single_height = corners[rows, single_corner], heights[rows, single_corner]
-    # the plane cuts the two sides from that corner to the others
-    ends = list[Array]()
-    for shift in (1, 2):
-        other_corner = (single_corner + shift) % 3
-        other_place, other_height = corners[rows, other_corner], heights[rows, other_corner]
-        fraction = (single_height / (single_height - other_height))[:, None]
-        ends.append((1 - fraction) * single_place + fraction * other_place)
-    return np.stack(ends, axis=1)
+    """Return the lines (n, 2, 3) over R in which a deformed surface meets the plane of a grid."""
+    return plane_section(surface, surface.r0 + surface.u, grid.corner, np.cross(*grid.sides))
 
 
 def _draw(

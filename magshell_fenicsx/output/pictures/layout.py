@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window, axes_on_screen
 from magshell_fenicsx.output.pictures.scales import Scale, colour_bar, pixel_canvas
+from magshell_fenicsx.output.pictures.sections import UprightSection
 from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -32,6 +33,9 @@ GAP = 4.0  # mm between panels
 ARROW_MARGIN = 0.012  # around the ends of arrows, over a panel's width
 FULL_ARROW_LENGTH = 0.08  # over a panel's width: a longer arrow has the full thickness
 LINE_HEIGHT = 1.45 / 72  # inches of a line of text, for each point of the font
+SECTION_LINES = 2.4  # of text: room around a section, with its words
+MAX_SECTION_HEIGHT = 0.5  # over the width of an image
+TINY = 1e-300  # least divisor
 LETTER_WIDTH = 0.47  # of the font
 LETTER_DISTANCE = 0.6  # least distance of letters at the directions
 MAX_SLOPE_TO_EYE = 0.3  # length in the picture over the length, of an arrow drawn as a point
@@ -79,6 +83,8 @@ class Panel:
         (x, y, letter) in the projection, of the poles of magnets.
     names
         (x, y, name) in the projection, of shells.
+    section
+        The shell in an upright plane, drawn below the image; None for none.
     """
 
     image: Image
@@ -89,6 +95,7 @@ class Panel:
     arrows: tuple[Arrow, ...] = ()
     texts: tuple[tuple[float, float, str], ...] = ()
     names: tuple[tuple[float, float, str], ...] = ()
+    section: UprightSection | None = None
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -114,6 +121,23 @@ class Panel:
         left, right, low, high = self.frame
         width = self.image.shape[1]
         return width * (high - low) / (right - left), width
+
+    @property
+    def section_size(self) -> tuple[float, float]:
+        """Height and width of the section in pixels, 0 without one.
+
+        It has the scale of the image, or a smaller one if it would be wider than that, or too tall.
+        """
+        if self.section is None:
+            return 0.0, 0.0
+        left, right, low, high = self.section.box
+        width = self.image.shape[1]
+        scale = min(
+            self.window.scale,
+            width / max(right - left, TINY),
+            MAX_SECTION_HEIGHT * width / max(high - low, TINY),
+        )
+        return scale * (high - low), scale * (right - left)
 
 
 def drawing(style: OutputSection) -> AbstractContextManager[None]:
@@ -186,6 +210,8 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
         _draw_names_of_arrows(boxes, panel, cell, left, lower)
         if panel.scale.colours:
             _draw_bar(boxes, panel.scale, cell, left, lower, with_directions=beside_bar)
+        if panel.section:
+            _draw_section(boxes, panel, panel.section, cell, left, lower)
     directions_size, lower = 3.4 * line_height, height - cell.height if beside_bar else foot_height
     lower += -3.3 * line_height if at_foot else 0.4 * line_height
     directions_axes = boxes.axes(
@@ -215,8 +241,10 @@ class _CellSizes:
         Width of a cell.
     image_height
         Height of the tallest image.
-    height_below
-        Height below an image, of the bar with its numbers and its caption.
+    height_of_bar
+        Height of the bar with its numbers and its caption, at the foot of a cell.
+    height_of_section
+        Height below an image, of the tallest section with its caption.
     height_above
         Height above an image, of a line for each field of arrows.
     """
@@ -224,7 +252,8 @@ class _CellSizes:
     line_height: float
     width: float
     image_height: float
-    height_below: float
+    height_of_bar: float
+    height_of_section: float
     height_above: float
 
     @classmethod
@@ -235,15 +264,45 @@ class _CellSizes:
         heights, widths = zip(*(panel.size for panel in panels), strict=True)
         image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
         has_bar = any(panel.scale.colours for panel in panels)
-        height_below = (4.2 if has_bar else 0.4) * line_height
+        height_of_bar = (4.2 if has_bar else 0.4) * line_height
+        section_height = max(panel.section_size[0] for panel in panels) / dpi
+        height_of_section = section_height + SECTION_LINES * line_height if section_height else 0.0
         legend_lines = max((_named_arrow_count(panel) for panel in panels), default=0)
         height_above = gap / 2 + legend_lines * line_height
-        return cls(line_height, cell_width, image_height, height_below, height_above)
+        return cls(
+            line_height, cell_width, image_height, height_of_bar, height_of_section, height_above
+        )
+
+    @property
+    def height_below(self) -> float:
+        """Height below an image."""
+        return self.height_of_bar + self.height_of_section
 
     @property
     def height(self) -> float:
         """Height of a cell."""
         return self.image_height + self.height_below + self.height_above
+
+
+def _draw_section(
+    boxes: "FigureBoxes",
+    panel: Panel,
+    section: UprightSection,
+    cell: _CellSizes,
+    left: float,
+    lower: float,
+) -> None:
+    """Draw the section of a panel between its image and its bar, with words below it.
+
+    `left` and `lower` are the lower left corner of the panel's cell.
+    """
+    height, width = (pixels / boxes.figure.dpi for pixels in panel.section_size)
+    middle, words_low = left + cell.width / 2, lower + cell.height_of_bar
+    low = words_low + cell.height_of_section - 0.5 * cell.line_height - height
+    section.draw(boxes.axes(middle - width / 2, low, width, height))
+    place = boxes.place(middle, low - 0.9 * cell.line_height)
+    words = f"section {section.words}; grey: undeformed"
+    boxes.figure.text(*place, words, ha="center", va="center", fontsize="small")
 
 
 def _draw_names_of_arrows(

@@ -39,16 +39,31 @@ class CurveStep:
         Name of the amplitude that varied.
     rows
         Rows of path.csv of the step, after the last row before it.
-    title
-        Title of the curve.
+    number
+        Number of the step in its programme; 0 without a programme.
     numbers
         Number of a point -> number of the instability there.
     """
 
     amplitude: str
     rows: Sequence[Row]
-    title: str = ""
+    number: int = 0
     numbers: Mapping[int, int] = field(default_factory=dict)
+
+
+def curve_title(steps: Sequence[CurveStep]) -> str:
+    """Return the title of the curves of steps over one amplitude; empty without a programme.
+
+    Examples
+    --------
+    >>> curve_title([CurveStep("pressure", [], 1), CurveStep("pressure", [], 3)])
+    'steps 1, 3: pressure'
+    """
+    numbers = [str(step.number) for step in steps if step.number]
+    if not numbers:
+        return ""
+    words = quantity(registered(steps[0].amplitude).column).words
+    return f"step{'s' * (len(numbers) > 1)} {', '.join(numbers)}: {words}"
 
 
 def instability_numbers(rows: Sequence[Row]) -> dict[int, int]:
@@ -74,7 +89,7 @@ def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
     steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
     numbers = instability_numbers(rows)
     if len(steps) < 2:
-        return [CurveStep(amplitude, last_varied_rows(rows, amplitude), "", numbers)]
+        return [CurveStep(amplitude, last_varied_rows(rows, amplitude), numbers=numbers)]
     curves = []
     for step in steps:
         first_row = next(i for i, row in enumerate(rows) if row["step"] == step)
@@ -82,10 +97,24 @@ def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
         row_before = max((i for i in range(first_row) if rows[i]["branch"] == 0), default=0)
         rows_of_step = [row for row in rows[first_row:] if row["step"] == step]
         name = str(rows_of_step[0]["amplitude"])
-        words = quantity(registered(name).column).words
-        title = f"step {step}: {words}"
-        curves.append(CurveStep(name, [rows[row_before], *rows_of_step], title, numbers))
+        curves.append(CurveStep(name, [rows[row_before], *rows_of_step], step, numbers))
     return curves
+
+
+def curve_panels(steps: Sequence[CurveStep]) -> list[list[CurveStep]]:
+    """Return the steps of a programme in groups with the same quantities on both axes.
+
+    A group is drawn in one panel, so that a load there and back is one loop. Motions, and steps
+    after a motion, have panels of their own. The last group has the last step.
+    """
+    groups = dict[tuple[str, ...], list[CurveStep]]()
+    motion_count = 0
+    for step in steps:
+        motion_count += step.amplitude == "time"
+        key = (str(motion_count), *(q.name for q in axes_for(step)), step.amplitude)
+        earlier_steps = groups.pop(key, [])
+        groups[key] = [*earlier_steps, step]
+    return list(groups.values())
 
 
 def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:

@@ -44,6 +44,7 @@ from magshell_fenicsx.output.pictures.layout import (
 )
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, RenderedSurface, Window
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map
+from magshell_fenicsx.output.pictures.sections import UprightSection, upright_section
 from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -143,8 +144,18 @@ def figures(
             view = views[width]
         with drawing(style):
             panels = [view.panel(layer, style) for layer in content.layers]
+            if name == "shell":
+                panels[0] = replace(panels[0], section=visible_section(surface, view.window))
             drawn_figures[name] = panels_figure(panels, style, content.note)
     return drawn_figures
+
+
+def visible_section(surface: Surface, window: Window) -> UprightSection | None:
+    """Return the upright section of a surface; None if its lines are one at the window's scale."""
+    largest = float(np.linalg.norm(surface.u, axis=1).max())
+    if largest * window.scale < MIN_OUTLINE_DISTANCE:
+        return None
+    return upright_section(surface)
 
 
 class Background:

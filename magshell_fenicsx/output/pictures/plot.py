@@ -29,7 +29,7 @@ from magshell_fenicsx.output.fields.vtu import (
 )
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure, worth_drawing
+from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_panels, frequencies_figure
 from magshell_fenicsx.output.pictures.curve_additions import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.error_band import errors_at_points
 from magshell_fenicsx.output.pictures.field_maps import field_maps_figure
@@ -312,8 +312,9 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
                 for number in shapes:
                     surface_of_shape, _ = run.surface_at(run.rows[number])
                     shells.append((run.rows[number], surface_of_shape))
-                steps = worth_drawing(curve_steps(run.rows, amplitude))
-                add_shapes(curve, steps, shells, style, run.camera)
+                add_shapes(
+                    curve, drawn_panels(run.rows, amplitude), shells, shell_data.h, run.camera
+                )
         yield from figure_files(curve, style, "curve")
         if run.resolved.get("sensors"):
             figure = readings_figure(run.rows, amplitude, run.resolved, style)

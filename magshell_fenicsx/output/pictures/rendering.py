@@ -300,19 +300,20 @@ def run_camera(surface: Surface, style: OutputSection) -> Camera:
     `surface` is seen: the shell at the point that the run is about.
     """
     if style.camera is None:
-        return _best_camera(surface, deflected_place(surface))
+        return _best_camera(surface)
     polar, azimuth = np.radians([style.camera.polar, style.camera.azimuth])
     x, y = np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)
     return Camera(np.array([x, y, np.cos(polar)]))
 
 
-def _best_camera(surface: Surface, place: Array) -> Camera:
-    """Return a camera from which a place (3,) of the shell is visible.
+def _best_camera(surface: Surface) -> Camera:
+    """Return a camera from which the largest displacement of the shell is visible.
 
-    If there are sources or bodies nearby, it is turned to where the shell fills more of the
-    picture.
+    A dome that has snapped through is seen from lower, so that it hangs below its rim. If there are
+    sources or bodies nearby, the camera is turned to where the shell fills more of the picture.
     """
-    default, outlines = Camera(viewing_direction(place)), near_outlines(surface)
+    place, height = deflected_place(surface), LOW_EYE if has_snapped(surface) else HIGH_EYE
+    default, outlines = Camera(viewing_direction(place, height=height)), near_outlines(surface)
     if not outlines:
         return default
     tessellation, r = tessellate(surface), surface.r0 + surface.u
@@ -328,20 +329,33 @@ def _best_camera(surface: Surface, place: Array) -> Camera:
         area = np.abs(x[0] * y[1] - x[1] * y[0]).sum() / 2
         return float(area / ((right - left) * (high - low)))
 
-    best = max((Camera(viewing_direction(place, turn)) for turn in TURNS), key=filled_fraction)
+    turned = (Camera(viewing_direction(place, turn, height)) for turn in TURNS)
+    best = max(turned, key=filled_fraction)
     return best if filled_fraction(best) > MIN_GAIN * filled_fraction(default) else default
 
 
-def viewing_direction(place: Array, turn: float = -0.5) -> Array:
+HIGH_EYE, LOW_EYE = 33.2, 18.0  # degrees above the horizon
+MIN_RISE = 0.05  # over the shell's extent: height of a dome above its lowest place
+
+
+def viewing_direction(place: Array, turn: float = -0.5, height: float = HIGH_EYE) -> Array:
     """Return a camera direction (3,) from which a place (3,) of a shell is visible.
 
-    It is from above and from the side. `turn` (rad) is its azimuth, measured from that of the
-    place.
+    It is from above and from the side; its length does not count.
+
+    Parameters
+    ----------
+    place
+        Undeformed place, over R.
+    turn
+        Azimuth (rad), measured from that of the place.
+    height
+        Angle (degrees) above the horizon.
     """
     has_azimuth = np.hypot(*place[:2]) > MIN_RADIUS
     heading = (np.arctan2(place[1], place[0]) if has_azimuth else DEFAULT_AZIMUTH) + turn
-    # some 33 degrees above the horizon; the length does not count
-    return np.array([4.2 * np.cos(heading), 4.2 * np.sin(heading), 2.75])
+    rise = np.tan(np.radians(height))
+    return 4.2 * np.array([np.cos(heading), np.sin(heading), rise])
 
 
 def deflected_place(surface: Surface) -> Array:
@@ -349,8 +363,23 @@ def deflected_place(surface: Surface) -> Array:
 
     For a ring-shaped dimple that is on the axis, whichever node has the largest displacement.
     """
+    return np.asarray(surface.r0[_most_deflected(surface)].mean(axis=0))
+
+
+def _most_deflected(surface: Surface) -> NDArray[np.bool_]:
+    """Return the mask (n,) of the nodes with the largest normal displacement."""
     size = np.abs(surface.w)
-    return np.asarray(surface.r0[size >= LARGEST_FRACTION * size.max()].mean(axis=0))
+    return np.asarray(size >= LARGEST_FRACTION * size.max())
+
+
+def has_snapped(surface: Surface) -> bool:
+    """Whether the nodes that move most have gone below all of the undeformed shell."""
+    lowest, nodes = surface.r0[:, 2].min(), _most_deflected(surface)
+    min_rise = MIN_RISE * np.ptp(surface.r0, axis=0).max()
+    height, deformed_height = (
+        r[nodes, 2].mean() - lowest for r in (surface.r0, surface.r0 + surface.u)
+    )
+    return bool(height > min_rise and deformed_height < 0)
 
 
 LARGEST_FRACTION = 0.999  # of the largest displacement: larger ones count as the largest

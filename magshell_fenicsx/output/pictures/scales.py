@@ -25,6 +25,7 @@ COLOURS = 257  # of a colour map
 END_DISTANCE = 0.16  # of a bar: ticks nearer to its ends give way to the numbers there
 END_DISTANCE_IN_LETTERS = 3.2  # the same on a short bar, in heights of a letter
 SHORT_BAR = 16  # heights of a letter
+PALENESS = 0.76  # part of matplotlib's colours in use: the others are darker than shade
 WHITE_ZONE = 0.1  # of the colour map around zero that is made lighter
 
 
@@ -67,8 +68,8 @@ def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colorma
     if name != SIGNED:
         return colormaps[name].resampled(COLOURS)
     # matplotlib's map has positions from 0 to 1: zero is at 0.5, and the limit with the larger
-    # magnitude is at one of its ends
-    positions = 0.5 + np.linspace(*limits, COLOURS) / (2 * max(map(abs, limits)))
+    # magnitude is near one of its ends, which are too dark for shade
+    positions = 0.5 + PALENESS * np.linspace(*limits, COLOURS) / (2 * max(map(abs, limits)))
     colours = colormaps["RdBu_r"](positions)[:, :3]
     # the middle of matplotlib's map is a light grey, which is made white
     nearness = np.clip(1 - np.abs(positions - 0.5) / WHITE_ZONE, 0, 1)[:, None]

@@ -43,6 +43,7 @@ from magshell_fenicsx.output.pictures.lines import (
     axes_for,
     curve_coordinates,
     curve_steps,
+    curve_title,
     is_unstable,
     line_coordinates,
     load_axis,
@@ -407,7 +408,7 @@ def _step(
         for line in line_coordinates(part)
     ]
     return {
-        "title": part.title or varied_quantity.words,
+        "title": curve_title([part]) or varied_quantity.words,
         "axes": [q.name for q in axes_for(part)],
         "varied": varied_quantity.name,
         "rows": numbers_of(part.rows),
