@@ -14,8 +14,10 @@ Words and units:
   one on the model's own mesh, over R.
 """
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from dolfinx import fem
@@ -26,7 +28,7 @@ from petsc4py import PETSc
 from magshell_fenicsx.case.open_problem import ProblemSource, problem_of, processes
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import SkewedTangent, State, Vector
+from magshell_fenicsx.continuation.system import SkewedTangent, State, Vector, max_abs
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.shells.mass import mass
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
@@ -136,9 +138,9 @@ class Model(Scene):
             self._show(state)
 
     @property
-    def amplitudes(self) -> dict[str, float]:
-        """The loads by name, each in the unit of its amplitude."""
-        return dict(self._state.mu)
+    def amplitudes(self) -> Mapping[str, float]:
+        """The loads by name, each in the unit of its amplitude; `set` changes them."""
+        return MappingProxyType(dict(self._state.mu))
 
     @property
     def held_unknowns(self) -> NDArray[np.int32]:
@@ -150,6 +152,8 @@ class Model(Scene):
 
     def set(self, **amplitudes: Amount) -> None:
         """Set amplitudes by name; the displacement stays.
+
+        All begin at 0, also those of a field and of a natural shape; own energies at their values.
 
         Parameters
         ----------
@@ -240,7 +244,7 @@ class Model(Scene):
         """Find the equilibrium at the amplitudes that are set, and put the model there.
 
         Newton's method starts at the state. If it fails, it starts at the last solution, and the
-        amplitudes go from there in steps that it manages.
+        amplitudes go from there in steps that it manages. A warning says where no load is set.
 
         Returns
         -------
@@ -256,6 +260,7 @@ class Model(Scene):
         """
         self.read_functions()
         target = self.state
+        self._warn_without_load(target)
         state, reason = self._equilibrium(target, self._solution)
         if state is None:
             state = self._step_by_step(target, reason)
@@ -266,6 +271,17 @@ class Model(Scene):
             pivots = self.newton.factor_at(state).negative_pivots
         point = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots)
         return Record("target", "", point).with_scene(self)
+
+    def _warn_without_load(self, target: State) -> None:
+        """Warn of a solve whose answer is the undeformed shell, as no load has been set."""
+        is_loaded = any(target.mu.values()) or any(self._solution.mu.values())
+        if not (is_loaded or max_abs(self.comm, target.u)) and target.mu:
+            names = ", ".join(target.mu)
+            warnings.warn(
+                f"solve: all loads are 0 ({names}): give values first, such as "
+                f"model.set({next(iter(target.mu))}=1)",
+                stacklevel=3,
+            )
 
     def modes(self, count: int = 6) -> list[Mode]:
         """Return the natural modes of lowest frequency at the state, ascending.

@@ -35,15 +35,27 @@ from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
 from magshell_fenicsx.python_keys import (
+    ContactKeys,
+    DeadLoadKeys,
+    EdgeKeys,
+    FactorKeys,
+    FactorKind,
     FieldKeys,
     ForceKeys,
     FoundationKeys,
+    GravityKeys,
+    ImperfectionKeys,
+    IndentationKeys,
     MeshKeys,
     NaturalKeys,
+    NaturalStepKeys,
     PressureKeys,
+    RotationKeys,
     SectionName,
-    StepKeys,
-    StepKind,
+    ShellKeys,
+    SourceKeys,
+    SpinKeys,
+    TimeKeys,
 )
 
 Keys = dict[str, Any]
@@ -126,20 +138,20 @@ class Shell:
         points: Mapping[str, Sequence[Any]] | None = None,
         mesh: Mapping[str, Any] | None = None,
         remanent: Mapping[str, Any] | None = None,
-        **keys: Any,
+        **keys: Unpack[ShellKeys],
     ) -> None:
         self.user_mesh: UserMesh | None = None
         self.name = name
         _refuse_nameless("shell.edges", edges, 'edges={"rim": 2}')
         _refuse_nameless("shell.patches", patches, 'patches={"magnet": 1}')
-        if isinstance(keys.get("thickness"), fem.Function | fem.Constant):
+        self._keys: Keys = {**keys} if radius is None else {**keys, "radius": radius}
+        if isinstance(self._keys.get("thickness"), fem.Function | fem.Constant):
             raise CaseError(
                 f"{NAME}: shell.thickness: is a length alone: give a number or text, and "
                 "thickness_factor, a function or a constant that multiplies it"
             )
         self._member_keys = {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
         self.files = Files()
-        self._keys = keys | ({} if radius is None else {"radius": radius})
         geometry = surface if isinstance(surface, str) else "mesh"
         if geometry not in SHAPES:
             raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
@@ -167,12 +179,13 @@ class Shell:
         self.files.given[Path(MESH).absolute()] = triangles
         self._keys |= {"geometry": "mesh", "file": MESH}
         # without any unit all lengths are plain numbers; a mesh without its own unit is in metres
-        has_units = isinstance(keys.get("thickness"), str)
+        thickness: Any = self._keys.get("thickness")
+        has_units = isinstance(thickness, str)
         if has_units or unit is not None:
             self._keys["unit"] = unit or "m"
         extents = np.ptp(triangles.nodes, axis=0)
-        if has_units and unit is None:
-            _refuse_metres(extents, radius, keys["thickness"])
+        if has_units:
+            _refuse_unit(extents, unit, radius, thickness)
         if radius is None:
             half_extent = float(extents.max()) / 2
             self._keys["radius"] = f"{half_extent!r} {unit or 'm'}" if has_units else half_extent
@@ -327,7 +340,33 @@ class Step(ProblemPart):
         If a case has no such kind, or the step has no such key.
     """
 
-    def __init__(self, kind: StepKind, **keys: Unpack[StepKeys]) -> None:
+    @overload
+    def __init__(self, kind: Literal["pressure"], **keys: Unpack[PressureKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["indentation"], **keys: Unpack[IndentationKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: FactorKind, **keys: Unpack[FactorKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["imperfection"], **keys: Unpack[ImperfectionKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["rotation"], **keys: Unpack[RotationKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["natural"], **keys: Unpack[NaturalStepKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["dead"], **keys: Unpack[DeadLoadKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["edge"], **keys: Unpack[EdgeKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["contact"], **keys: Unpack[ContactKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["source"], **keys: Unpack[SourceKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["spin"], **keys: Unpack[SpinKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["gravity"], **keys: Unpack[GravityKeys]) -> None: ...
+    @overload
+    def __init__(self, kind: Literal["time"], **keys: Unpack[TimeKeys]) -> None: ...
+    def __init__(self, kind: str, **keys: Any) -> None:
         known_kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
         if known_kind not in STEPS:
             raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
@@ -437,12 +476,16 @@ class Field(ProblemPart):
     Parameters
     ----------
     remanent, applied
-        A vector of three numbers or formulas, of the remanence too a function on the mesh or its
-        kind in a case, such as "radial"; or all its keys in a case. In formulas x, y, z are the
-        place over R, the `radius` of the shell, and never the coordinates of the mesh: of the
-        remanence the undeformed place, of the applied field the deformed one. A function on the
-        mesh is interpolated with x in the mesh's coordinates: with R = 40 mm, "sin(pi*x/2)" is
-        `interpolate(lambda x: np.sin(np.pi * x[0] / 80))` on a mesh in mm.
+        A vector of three numbers, texts with a unit such as "90 mT", or formulas; of the remanence
+        too a function on the mesh or its kind in a case, such as "radial"; or all its keys in a
+        case. In formulas x, y, z are the place over R, the `radius` of the shell, and never the
+        coordinates of the mesh: of the remanence the undeformed place, of the applied field the
+        deformed one. A function on the mesh is interpolated with x in the mesh's coordinates: with
+        R = 40 mm, "sin(pi*x/2)" is `interpolate(lambda x: np.sin(np.pi * x[0] / 80))` on a mesh in
+        mm.
+    lambda_m
+        |B^r| |B^a|/(mu_0 E). It is positive where the field is along `applied`, also as an
+        amplitude, and negative where the field is reversed.
     keys
         What else a case has under `magnetic`.
     """
@@ -500,36 +543,41 @@ def _refuse_mesh_keys(geometry: str, **mesh_keys: Any) -> None:
         raise CaseError(f"{NAME}: shell.{unfit}: is of a mesh; a {geometry} has its own edges")
 
 
-def _refuse_metres(
-    extents: NDArray[np.float64], radius: float | str | None, thickness: str
+def _refuse_unit(
+    extents: NDArray[np.float64], unit: str | None, radius: float | str | None, thickness: str
 ) -> None:
-    """Check that the bounds of a mesh without a unit may be those of a shell in metres.
+    """Check that the bounds of a mesh may be those of a shell with this radius and thickness.
 
     Parameters
     ----------
     extents
         (3,), lengths of the mesh along its axes.
-    radius, thickness
-        As the user has given them; a radius of None is not compared.
+    unit, radius, thickness
+        As the user has given them; a radius of None is not compared, nor is the thickness beside a
+        unit. A mesh without a unit is in metres.
 
     Raises
     ------
     CaseError
         If the largest extent is far from the radius, or from that of a shell with this thickness.
     """
-    extent = float(extents.max())
+    unit_in_metres = _in_metres(f"1 {unit or 'm'}")
+    if unit_in_metres is None:  # refused elsewhere
+        return
     bounds = " x ".join(f"{length:.4g}" for length in extents)
-    limits = {
-        "radius": (radius, 1 / MAX_EXTENT_OVER_RADIUS, MAX_EXTENT_OVER_RADIUS),
-        "thickness": (thickness, MIN_EXTENT_OVER_THICKNESS, MAX_EXTENT_OVER_THICKNESS),
-    }
+    unnamed = "" if unit else "shell.unit: is not given, so "
+    another = "another unit" if unit else 'unit="mm", for instance'
+    limits = {"radius": (radius, 1 / MAX_EXTENT_OVER_RADIUS, MAX_EXTENT_OVER_RADIUS)}
+    if unit is None:
+        limits["thickness"] = (thickness, MIN_EXTENT_OVER_THICKNESS, MAX_EXTENT_OVER_THICKNESS)
     for name, (length, least, most) in limits.items():
         metres = _in_metres(length)  # None: not given, or refused elsewhere
-        if metres and not least <= extent / metres <= most:
+        ratio = float(extents.max()) * unit_in_metres / (metres or np.nan)
+        if metres and not least <= ratio <= most:
+            way_out = "leave the radius out" if name == "radius" else 'unit="m" if that is right'
             raise CaseError(
-                f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, "
-                f"{extent / metres:.4g} times as long as {name}, {length}: give "
-                'unit="mm", for instance, or unit="m" if that is right'
+                f"{NAME}: {unnamed}the mesh is {bounds} {unit or 'm'}, {ratio:.4g} times as long "
+                f"as {name}, {length}: give {another}, or {way_out}"
             )
 
 
@@ -567,7 +615,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
     Raises
     ------
     CaseError
-        If it is no vector of three numbers or formulas.
+        If it is no vector of three numbers or formulas, or has a unit beside `lambda_m`.
     """
 
     def magnitude_key(tesla: float) -> Keys:
@@ -592,6 +640,12 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
     components = shell.plain_value(value, key)
     if not isinstance(components, list) or len(components) != 3:
         raise CaseError(f"{NAME}: {key}: {components}: a vector has three components")
+    if dimensionless and any(_in_tesla(item) != item for item in components):
+        raise CaseError(
+            f"{NAME}: {key}: {components}: with lambda_m vectors are over their magnitudes: give "
+            "numbers, or leave lambda_m out"
+        )
+    components = [_in_tesla(item) for item in components]
     # formulas stay components; so does a zero vector in a dimensionless problem, where no magnitude
     # could say that it is zero
     is_dimensionless_zero = dimensionless and not any(components)
@@ -607,6 +661,14 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
     return {**direction, **magnitude_key(hypot(x, y, z))}
 
 
+def _in_tesla(component: Any) -> Any:
+    """Return a component such as "90 mT" as a number in tesla; a number or a formula stays."""
+    try:
+        return in_units("tesla")(component)
+    except ValueError:
+        return component
+
+
 class _ProblemType(type):
     """Type of `Problem`: problems of cases, too, are instances of it."""
 
@@ -615,7 +677,7 @@ class _ProblemType(type):
 
 
 class Problem(problem.Problem, metaclass=_ProblemType):
-    """A complete problem, for `follow`, `Scene` and other functions that take a problem.
+    """A complete problem, for `Model`, `follow` and other functions that take a problem.
 
     Parameters
     ----------
@@ -639,7 +701,9 @@ class Problem(problem.Problem, metaclass=_ProblemType):
     Raises
     ------
     CaseError, MeshError
-        One message with every mistake; on every rank.
+        One message with every mistake of the keys; on every rank. Whether the mesh has the edges,
+        patches and points that are named, and whether the supports hold the shell, is found out
+        when a `Model` is made.
     """
 
     def __new__(  # type: ignore[misc]  # a problem is the same whatever makes it

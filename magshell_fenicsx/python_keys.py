@@ -1,4 +1,4 @@
-"""Keys of loads in a case, with their types, for arguments of `python.Pressure` and others.
+"""Keys of a case with their types, for arguments of `python.Shell`, `Pressure`, `Step` and others.
 
 An editor and mypy know them from here. Values are checked when a problem is made.
 
@@ -34,33 +34,42 @@ SectionName: TypeAlias = Literal[  # whose keys are free, or many
 ]
 
 
-class CourseKeys(TypedDict, total=False):
-    """Keys of every step but one in time: how far it goes, and what follows.
+class ProgrammeKeys(TypedDict, total=False):
+    """Keys of every step.
 
     Attributes
     ----------
     points
         Number of points up to the target.
+    hold
+        Amplitude -> "conjugate" where its conjugate is held in place of the load.
+    search
+        Keys of the search for further solutions at the end.
+    """
+
+    points: int
+    hold: Mapping[str, Any]
+    search: Mapping[str, Any]
+
+
+class CourseKeys(ProgrammeKeys, total=False):
+    """Keys of a step whose load grows: how far it goes, and what follows.
+
+    Attributes
+    ----------
     until
         Where the step ends.
     then
         What follows an instability at the end: a snap, or the branch.
     snap
         Keys of the motion of a snap.
-    hold
-        Amplitude -> "conjugate" where its conjugate is held in place of the load.
-    search
-        Keys of the search for further solutions at the end.
     branches, sensitivities
         Whether the branches of a bifurcation are followed, and sensitivities computed.
     """
 
-    points: int
     until: Literal["limit", "bifurcation", "target", "points", "zero"]
     then: Literal["snap", "follow"]
     snap: Mapping[str, Any]
-    hold: Mapping[str, Any]
-    search: Mapping[str, Any]
     branches: bool
     sensitivities: bool
 
@@ -106,89 +115,123 @@ class ForceKeys(CourseKeys, total=False):
     patch: Amount
 
 
-StepKind: TypeAlias = Literal[
-    "pressure",
-    "indentation",
-    "field",
-    "rotation",
-    "natural",
-    "imperfection",
-    "dead",
-    "edge",
-    "contact",
-    "source",
-    "time",
-    "spin",
-    "gravity",
-    "interaction",
-    "crease",
-    "fold",
-]
+class IndentationKeys(ForceKeys, total=False):
+    """Keys of a step of kind "indentation": those of a force, and the place `at` which it acts."""
+
+    at: Mapping[str, Any]
 
 
-class StepKeys(CourseKeys, total=False):
-    """Keys of steps of all kinds; which kind has which is checked when the step is made.
+FactorKind: TypeAlias = Literal["field", "interaction", "crease", "fold"]
+
+
+class FactorKeys(CourseKeys, total=False):
+    """Keys of a step of one of the kinds `FactorKind`, whose target is a factor.
 
     Attributes
     ----------
     control
-        What is prescribed: the load, what is conjugate to it, or the arc length of the path.
+        What is prescribed: the load, or the arc length of the path. So it is of other kinds.
     factor
-        Target of "field", "imperfection", "dead", "edge", "source", "interaction", "crease".
-    pressure, volume_change, on, profile
-        Of "pressure", as of `PressureKeys`.
-    at, depth, force, patch
-        Of "indentation": the point, and as of `ForceKeys`.
-    body, approach
-        Of "contact": the body's name and the target, beside `force`.
-    loads, displacement
-        Of "dead": the forces, tractions and moments, and a target.
-    name, moves, reaction
-        Of "edge": the name of its columns, what moves, and a target.
-    grows, curvature, stretch
-        Of "natural": what grows, and the targets.
-    item
-        Of "imperfection": its number.
-    source, move, to, turn, strength
-        Of "source": its number or name, and what becomes of it; `to` of "rotation" the direction.
-    speed
-        Of "spin": the target.
-    direction, acceleration
-        Of "gravity": where the weight points, and the target.
-    duration, history, rho_inf, step, tolerance, errors, balance, drag, push, velocity, event
-        Of "time".
+        The target, over what the case gives.
     """
 
-    control: Literal["volume", "load", "arc", "displacement", "reaction", "approach", "force"]
+    control: Literal["load", "arc"]
     factor: float
-    pressure: Amount
-    volume_change: Amount
-    on: Mapping[str, Literal["outside", "inside"]]
-    profile: str
-    at: Mapping[str, Any]
-    depth: Amount
-    force: Amount
-    patch: Amount
-    body: str
-    approach: Amount
-    loads: Sequence[Mapping[str, Any]]
-    displacement: Amount
-    name: str
-    moves: Sequence[Mapping[str, Any]]
-    reaction: Amount
+
+
+class ImperfectionKeys(FactorKeys, total=False):
+    """Keys of a step of kind "imperfection": the number of the `item` that grows, and a factor."""
+
+    item: int
+
+
+class RotationKeys(ProgrammeKeys, total=False):
+    """Keys of a step of kind "rotation": the direction `to` which the field turns."""
+
+    to: Mapping[str, Any]
+
+
+class NaturalStepKeys(CourseKeys, total=False):
+    """Keys of a step of kind "natural": what grows, and the targets."""
+
+    control: Literal["load", "arc"]
     grows: Literal["curvature", "stretch"]
     curvature: float
     stretch: float
-    item: int
+
+
+class DeadLoadKeys(CourseKeys, total=False):
+    """Keys of a step of kind "dead": the forces, tractions and moments, and a target."""
+
+    control: Literal["load", "displacement", "arc"]
+    loads: Sequence[Mapping[str, Any]]
+    factor: float
+    displacement: Amount
+
+
+class EdgeKeys(CourseKeys, total=False):
+    """Keys of a step of kind "edge": the name of its columns, what moves, and a target."""
+
+    control: Literal["load", "reaction", "arc"]
+    name: str
+    moves: Sequence[Mapping[str, Any]]
+    factor: float
+    reaction: Amount
+
+
+class ContactKeys(CourseKeys, total=False):
+    """Keys of a step of kind "contact": the body's name, and a target."""
+
+    control: Literal["approach", "force", "arc"]
+    body: str
+    approach: Amount
+    force: Amount
+
+
+class SourceKeys(FactorKeys, total=False):
+    """Keys of a step of kind "source": its number or name, and what becomes of it."""
+
+    name: str
     source: int | str
     move: Sequence[Amount]
-    to: Mapping[str, Any] | Sequence[Amount]
+    to: Sequence[Amount]
     turn: Mapping[str, Any]
     strength: float
+
+
+class SpinKeys(CourseKeys, total=False):
+    """Keys of a step of kind "spin": the target of the angular speed."""
+
+    control: Literal["load", "arc"]
     speed: Amount
+
+
+class GravityKeys(CourseKeys, total=False):
+    """Keys of a step of kind "gravity": where the weight points, and the target."""
+
+    control: Literal["load", "arc"]
     direction: Sequence[float]
     acceleration: Amount
+
+
+class TimeKeys(ProgrammeKeys, total=False):
+    """Keys of a step of kind "time", a motion.
+
+    Attributes
+    ----------
+    duration, until, event
+        Where it ends.
+    history
+        Amplitude -> its course in time.
+    rho_inf, step, tolerance, errors, balance
+        Of the integration in time.
+    drag, push, velocity
+        Damping, and how the motion begins.
+    """
+
     duration: Amount
+    until: Literal["duration", "rest", "event", "instability"]
+    event: Mapping[str, Any]
     history: Mapping[str, Any]
     rho_inf: float
     step: Amount
@@ -198,7 +241,6 @@ class StepKeys(CourseKeys, total=False):
     drag: Amount
     push: Mapping[str, Any]
     velocity: Sequence[Amount]
-    event: Mapping[str, Any]
 
 
 class FieldKeys(TypedDict, total=False):
@@ -278,3 +320,50 @@ class MeshKeys(TypedDict, total=False):
     size: Amount
     penalty: float
     tolerance: float
+
+
+class ShellKeys(TypedDict, total=False):
+    """Keys of the section `shell` that are no arguments of `python.Shell` of their own.
+
+    Which geometry has which is checked when the shell is made.
+
+    Attributes
+    ----------
+    radius_to_thickness, thickness, thickness_factor
+        R/h or h, and what multiplies it at each place.
+    youngs_modulus, poisson_ratio, density
+        Of the material.
+    law, mooney, mu, alpha
+        The law of the material, and its parameters.
+    laminate, viscosity, relaxation
+        Plies in place of one material; damping.
+    defect, imperfections
+        Deviations from the perfect shape.
+    azimuth, polar, hole, length, width, inner_radius, tube_radius, tube, profile
+        Sizes of the geometry.
+    """
+
+    radius_to_thickness: float
+    thickness: Amount
+    thickness_factor: AtPlace
+    youngs_modulus: Amount
+    poisson_ratio: float
+    density: Amount
+    law: Literal["koiter", "neo-hookean", "mooney-rivlin", "ogden"]
+    mooney: float
+    mu: Sequence[float]
+    alpha: Sequence[float]
+    laminate: Mapping[str, Any]
+    viscosity: Amount
+    relaxation: Sequence[Mapping[str, Any]]
+    defect: Mapping[str, Any]
+    imperfections: Sequence[Mapping[str, Any]]
+    azimuth: Sequence[float]
+    polar: float
+    hole: float
+    length: Amount
+    width: Amount
+    inner_radius: Amount
+    tube_radius: Amount
+    tube: Sequence[float]
+    profile: Mapping[str, Any]

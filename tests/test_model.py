@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from slepc4py import SLEPc
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.assembly.field_gradient import FieldGradient
 
 # a small rectangle with x in mm and a height that is a quarter of a wave
 LENGTH, WIDTH, HEIGHT = 40.0, 15.0, 4.0
@@ -59,8 +60,13 @@ def strip(comm: MPI.Intracomm = MPI.COMM_SELF) -> tuple[mesh.Mesh, dict[str, Any
 def model_of_strip(comm: MPI.Intracomm = MPI.COMM_SELF) -> ms.Model:
     """A strip under its weight."""
     surface, arguments = strip(comm)
+    return model_of_weight(ms.Shell(surface, **arguments))
+
+
+def model_of_weight(shell: ms.Shell) -> ms.Model:
+    """A shell with an edge `root` under its weight."""
     problem = ms.Problem(
-        ms.Shell(surface, **arguments),
+        shell,
         ms.Clamped("root"),
         ms.Step("dead", loads=[{"over": "all", "per_area": ["0 Pa", "0 Pa", "-1 Pa"]}], factor=1),
         degree=3,
@@ -179,6 +185,34 @@ def test_displacement_is_one_function() -> None:
     assert np.abs(model.residual().array).max() > 0
     model.solve()
     assert np.abs(u.x.array).max() == pytest.approx(tip, rel=1e-9)
+
+
+def test_gradient_along_functions_of_other_degrees() -> None:
+    """A thickness of degree 1 or 2, the displacement of degree 3: differences of solutions."""
+    surface, arguments = strip()
+    V = fem.functionspace(surface, ("Lagrange", 1))
+    thickness, waves = fem.Function(V), fem.Function(V)
+    bump = fem.Function(fem.functionspace(surface, ("DG", 2)))
+    thickness.interpolate(lambda x: 1 + 0.2 * np.sin(x[0] / 15))
+    waves.interpolate(lambda x: np.cos(x[0] / 2))  # another function than the formula at all nodes
+    model = model_of_weight(ms.Shell(surface, thickness_factor=thickness, **arguments))
+    model.set(load=1)
+    record = model.solve()
+    gradient = ms.gradient(model, record, of="energy", by="thickness")["thickness"]
+    assert isinstance(gradient, FieldGradient)
+    mean, energies = thickness.x.array.copy(), list[float]()
+    for side in (1, -1):
+        thickness.x.array[:] = mean + side * 1e-3 * waves.x.array
+        energies.append(model.observe(model.solve().point.state)["energy"])
+    expected = (energies[0] - energies[1]) / 2e-3
+    assert gradient.along(waves) == pytest.approx(expected, rel=1e-5)
+    bump.interpolate(waves)
+    assert gradient.along(bump) == pytest.approx(gradient.along(waves), rel=1e-12)
+    with pytest.raises(ValueError, match=r"shape \(16, 10\): give \(16, 10, 1\)"):
+        gradient.along(gradient.forces[..., 0])
+    finer = fem.Function(fem.functionspace(surface, ("DG", 4)))
+    with pytest.raises(ms.MeshError, match="along: is a function of degree 4; allowed is at most"):
+        gradient.along(finer)
 
 
 def test_function_of_an_own_energy_in_a_loop() -> None:

@@ -7,7 +7,7 @@ displacement u. dPi/du[w] is the work of the term's forces along a vector w. Der
 cell, (cells, nodes, components), so that a change may be constant in a cell or in a patch.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,22 +56,41 @@ class FieldGradient:
     places, normals
         (cells, nodes, 3): undeformed places, over R, and normals at these nodes; of a deviation
         those of the perfect shell.
+    at_nodes
+        Function from one on a program's mesh to its values at these nodes, as `forces`; collective.
     """
 
     field: fem.Function
     forces: Array
     places: Array
     normals: Array
+    at_nodes: Callable[[fem.Function], Array]
 
-    def along(self, change: Array) -> float:
+    def along(self, change: Array | fem.Function) -> float:
         """Return the derivative along a change of the field. Collective.
 
         Parameters
         ----------
         change
-            (cells, nodes, components), as `forces`.
+            The change in the unit of the gradient's field: a function on the mesh that the program
+            has given, or an array (cells, nodes, components), as `forces`. A formula at `places` is
+            another change than the function into which it was interpolated, unless this has the
+            degree of the displacement.
+
+        Raises
+        ------
+        ValueError
+            If the array has another shape, or there is no mesh on which a function could be.
+        MeshError
+            If the function is on another mesh, or its degree is above that of the displacement.
         """
-        return float(self._sum(np.sum(self.forces * change)))
+        values = self.at_nodes(change) if isinstance(change, fem.Function) else np.asarray(change)
+        if values.shape != self.forces.shape:
+            raise ValueError(
+                f"along: the change has the shape {values.shape}: give {self.forces.shape} (cells, "
+                "nodes, components), or a fem.Function on the shell's mesh"
+            )
+        return float(self._sum(np.sum(self.forces * values)))
 
     def cells(self) -> Array:
         """Return the derivatives by a field that is constant within each cell.
@@ -79,7 +98,8 @@ class FieldGradient:
         Returns
         -------
         Array
-            (cells, components) of this rank's own cells.
+            (cells, components) of this rank's own cells; on one process those of a mesh that the
+            program has given are in its order.
         """
         return np.asarray(self.forces.sum(axis=1))
 

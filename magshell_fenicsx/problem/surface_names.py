@@ -76,7 +76,10 @@ def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
             owner = "another energy, integral or parameter of these terms"
         else:
             continue
-        raise CaseError(f"terms: {name}: something else has this name already: {owner}")
+        raise CaseError(
+            f"terms: {name}: something else has this name already: {owner}; give another one, such "
+            f"as own_{name}"
+        )
 
 
 def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:

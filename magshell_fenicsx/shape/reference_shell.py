@@ -43,7 +43,7 @@ CIRCLE_POINTS = 49  # of a line along a circle
 
 class At(Direction):
     """A direction from the centre of a sphere, `polar: 0` of a pole or a centre; or a place of the
-    perfect surface.
+    perfect surface, which alone a mesh takes.
     """
 
     point: Coordinates | None = None

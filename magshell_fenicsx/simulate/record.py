@@ -7,6 +7,7 @@ break it.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magshell_fenicsx.continuation.point import Point
@@ -135,7 +136,8 @@ class Record:
 
         `ms.trace(record, name, first=...)` follows one. A mode of the model itself has two, along
         the mode and against it. A mode that the model excludes has one, in the smallest model that
-        has the mode (`record.scene`): the other is the same shape, turned or mirrored. That model
+        has the mode (`record.scene`): the other is the same shape, turned or mirrored. A warning,
+        and `said` of its record, say how much the results of the two models differ. That model
         takes over the journal of the run, which must have ended.
 
         Raises
@@ -185,6 +187,11 @@ class Record:
 
         scene = self.known_scene("solutions")
         return solutions(scene, self, most=most, guesses=guesses, stable=stable, seconds=seconds)
+
+    @property
+    def amplitudes(self) -> Mapping[str, float]:
+        """The loads by name, each in the unit of its amplitude."""
+        return MappingProxyType(dict(self.point.state.mu))
 
     @property
     def u(self) -> "fem.Function":

@@ -416,7 +416,7 @@ class Scene:
         """
         displacement = fem.Function(self.model.u.function_space, name="u")
         displacement.x.array[:] = values
-        surface, user_mesh = self.model.midsurface, self._user_mesh()
+        surface, user_mesh = self.model.midsurface, self.user_mesh()
         if not (surface and user_mesh):
             return displacement
         return user_mesh.displacement(displacement, surface.source_triangles, self._user_length)
@@ -424,7 +424,7 @@ class Scene:
     def unknowns_of(self, u: fem.Function) -> Vector:
         """Return the unknowns of a displacement like that of `displacement`; collective."""
         displacement = fem.Function(self.model.u.function_space)
-        surface, user_mesh = self.model.midsurface, self._user_mesh()
+        surface, user_mesh = self.model.midsurface, self.user_mesh()
         if surface and user_mesh:
             user_mesh.put_displacement(u, displacement, surface.source_triangles, self._user_length)
         else:
@@ -437,13 +437,18 @@ class Scene:
         assert self.problem.mesh_file
         return self.problem.mesh_file.scale
 
-    def _user_mesh(self) -> UserMesh | None:
+    def user_mesh(self, name: str = "u") -> UserMesh | None:
         """Return the mesh that a program has given; None without one.
+
+        Parameters
+        ----------
+        name
+            What needs its functions, for messages.
 
         Raises
         ------
         ValueError
-            If its functions cannot show the displacement.
+            If functions on it are none of the scene: of half a mesh, or of other ranks.
         """
         mesh_file = self.problem.mesh_file
         user_mesh = mesh_file.user_mesh if mesh_file and self.model.midsurface else None
@@ -451,11 +456,11 @@ class Scene:
             return None
         if self.problem.is_half:
             raise ValueError(
-                "u: symmetry: half: half of the mesh is not modelled: take symmetry: none"
+                f"{name}: symmetry: half: half of the mesh is not modelled: take symmetry: none"
             )
         if MPI.Comm.Compare(self.comm, user_mesh.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
-                f"u: {self.comm.size} processes solve the scene and the mesh belongs to "
+                f"{name}: {self.comm.size} processes solve the scene and the mesh belongs to "
                 f"{user_mesh.comm.size}: make the scene with those of the mesh, ms.Model(problem)"
             )
         return user_mesh
@@ -477,7 +482,7 @@ class Scene:
 
     @staticmethod
     def refuse_other_arguments(name: str, scene: object, records: Sequence[object]) -> None:
-        """Check that a function of a model and of records gets them in this order.
+        """Check that a function of a model and of its records gets them in this order.
 
         Parameters
         ----------
@@ -487,11 +492,16 @@ class Scene:
         Raises
         ------
         ValueError
-            If `scene` is no scene, or one of the others no record.
+            If `scene` is no scene, one of the others no record, or a record of another run.
         """
-        if isinstance(scene, Scene) and all(isinstance(record, Record) for record in records):
-            return
-        raise ValueError(f"{name}: give the model first, then what follow or trace yield")
+        if not isinstance(scene, Scene) or not all(isinstance(each, Record) for each in records):
+            raise ValueError(f"{name}: give the model first, then what follow or trace yield")
+        # models of one run, from which modes lead into others, share its journal
+        scenes = [record.scene for record in records if isinstance(record, Record)]
+        if any(other and other.journal is not scene.journal for other in scenes):
+            raise ValueError(
+                f"{name}: a record is of another model: give record.scene in place of the model"
+            )
 
     def refuse_foreign(self, state: State, *, allows_more: bool = False) -> None:
         """Check that a state may be one of this scene, by its numbers and names.

@@ -17,6 +17,7 @@ Words and symbols:
 - A located record is a fold or a bifurcation. Own modes are those that the model itself has.
 """
 
+import warnings
 from dataclasses import replace
 
 from magshell_fenicsx.continuation.continuation_run import MAX_STEPS, ContinuationGoal
@@ -347,8 +348,12 @@ def first_records_of_branches(bifurcation: Record) -> list[Record]:
         point = switch.stage.point(with_fit_contact(switch.stage, switch.path, start))
         point = replace(point, state=new_scene.model.system.advance(point.state, state.mu))
         unstable = unstable_count(new_scene.model.symmetry_breaking_modes, point.state)
-        record = Record("step", name, point, branch=number, excluded_pivots=unstable)
+        record = Record(
+            "step", name, point, branch=number, excluded_pivots=unstable, said=switch.said
+        )
         records.append(record.with_scene(new_scene, bifurcation.step))
+    if switch.said:
+        warnings.warn(switch.said, stacklevel=3)
     return records
 
 

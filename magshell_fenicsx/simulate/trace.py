@@ -209,7 +209,10 @@ def trace(  # noqa: PLR0913
     sense = float(np.copysign(1.0, first * first_point.dmu))
     goal = ContinuationGoal(until, targets, quantity, steps, sense)
     records_of_path = follow_path(load_stage(scene), path, first_point, goal)
-    records = chain([Record("start", "", first_point)], records_of_path)
+    # a state of which nothing is known is taken for stable but for the modes of the model itself
+    excluded_pivots = start.excluded_pivots if isinstance(start, Record) else 0
+    first_record = Record("start", "", first_point, excluded_pivots=excluded_pivots)
+    records = chain([first_record], records_of_path)
     yield from _with_reached(
         (record.with_scene(scene) for record in records),
         name,

@@ -33,9 +33,11 @@ def test_a_branch_in_a_larger_model() -> None:
     """Waves around a meridian are followed in a sector, from the load of the bifurcation on."""
     model = ms.Model({**CAP, "mesh": {"refinement": 0.7}})
     *before, bifurcation = ms.trace(model, "pressure", first=0.05, until="bifurcation")
-    (branch,) = bifurcation.branches()
+    with pytest.warns(UserWarning, match="the branch of the mode .* is followed in the sector"):
+        (branch,) = bifurcation.branches()
     assert branch.scene is not model
-    *_, end = ms.trace(branch, "pressure", first=-0.005, until="points", steps=2)
+    start, *_, end = ms.trace(branch, "pressure", first=-0.005, until="points", steps=2)
+    assert start.excluded_pivots == branch.excluded_pivots == end.excluded_pivots
     assert end.scene is branch.scene
     assert end.point.state.mu["pressure"] < branch.point.state.mu["pressure"]
     assert np.linalg.norm(end.point.state.u) > np.linalg.norm(branch.point.state.u)

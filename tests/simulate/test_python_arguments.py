@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_overloads, get_type_hints
 
 import basix.ufl
 import numpy as np
@@ -22,17 +22,30 @@ from magshell_fenicsx.parts.natural.section import NaturalSection
 from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
 from magshell_fenicsx.problem.mesh_sizes import MeshSection
 from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.python import SHAPES
 from magshell_fenicsx.python_keys import (
+    ContactKeys,
+    DeadLoadKeys,
+    EdgeKeys,
+    FactorKeys,
+    FactorKind,
     FieldKeys,
-    ForceKeys,
     FoundationKeys,
+    GravityKeys,
+    ImperfectionKeys,
+    IndentationKeys,
     MeshKeys,
     NaturalKeys,
+    NaturalStepKeys,
     PressureKeys,
+    RotationKeys,
     SectionName,
-    StepKeys,
-    StepKind,
+    ShellKeys,
+    SourceKeys,
+    SpinKeys,
+    TimeKeys,
 )
+from magshell_fenicsx.simulate.record import Record
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
@@ -160,32 +173,49 @@ def test_parts_are_classes() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("keys", "section"),
-    [(PressureKeys, STEPS["pressure"]), (ForceKeys, STEPS["indentation"])],
-)
-def test_keys_of_loads_are_those_of_a_case(keys: type, section: type[BaseModel]) -> None:
-    """The keys that editors know are those that a case has."""
-    assert {*keys.__annotations__} == {*section.model_fields} - {"kind", "at"}
+KEYS_OF_STEPS = {
+    "pressure": PressureKeys,
+    "indentation": IndentationKeys,
+    **dict.fromkeys(set(get_args(FactorKind)) & {*STEPS}, FactorKeys),
+    "imperfection": ImperfectionKeys,
+    "rotation": RotationKeys,
+    "natural": NaturalStepKeys,
+    "dead": DeadLoadKeys,
+    "edge": EdgeKeys,
+    "contact": ContactKeys,
+    "source": SourceKeys,
+    "spin": SpinKeys,
+    "gravity": GravityKeys,
+    "time": TimeKeys,
+}
+
+
+@pytest.mark.parametrize("kind", STEPS)
+def test_keys_of_steps_are_those_of_a_case(kind: str) -> None:
+    """The keys that editors and mypy know are those that a case has."""
+    keys, section = KEYS_OF_STEPS[kind], STEPS[kind]
+    assert {*get_type_hints(keys)} == {*section.model_fields} - {"kind"}
     for name, annotation in get_type_hints(keys).items():
         if get_origin(annotation) is Literal:
             known = section.model_fields[name].annotation
             assert annotation in (known, *get_args(known))
 
 
-def test_keys_of_steps_are_those_of_a_case() -> None:
-    """Of all kinds together; each has its words."""
-    assert {*get_args(StepKind)} == {*STEPS} | {former for former, _ in FORMER_KINDS}
-    assert {*get_type_hints(StepKeys)} == {
-        key for section in STEPS.values() for key in section.model_fields
-    } - {"kind"}
-    controls = {
-        word
-        for section in STEPS.values()
-        if "control" in section.model_fields
-        for word in get_args(section.model_fields["control"].annotation)
-    }
-    assert {*get_args(get_type_hints(StepKeys)["control"])} == controls
+def test_kinds_of_steps_are_those_of_a_case() -> None:
+    """Each is a kind of one overload of `ms.Step`, also by its former name."""
+    kinds = [
+        kind
+        for overload in get_overloads(ms.Step.__init__)
+        for kind in get_args(get_type_hints(overload)["kind"])
+    ]
+    assert sorted(kinds) == sorted([*STEPS, *(former for former, _ in FORMER_KINDS)])
+
+
+def test_keys_of_shells_are_those_of_a_case() -> None:
+    """Of all geometries together."""
+    arguments = {"geometry", "file", "unit", "radius"}
+    of_case = {key for section in SHAPES.values() for key in section.model_fields}
+    assert {*ShellKeys.__annotations__} == of_case - arguments
 
 
 @pytest.mark.parametrize(
@@ -298,7 +328,8 @@ def cell_tags(surface: mesh.Mesh) -> mesh.MeshTags:
         ),
         (
             lambda: problem_of(ms.OwnTerm("pressure", lambda r0, u: u.r[2] ** 2)),
-            "terms: pressure: something else has this name already: an amplitude or a column",
+            "something else has this name already: an amplitude or a column of the package; give "
+            "another one, such as own_pressure",
         ),
         (
             lambda: ms.Problem(shell_of(), points=[[0, 0, 0]]),  # type: ignore[arg-type]
@@ -353,6 +384,10 @@ def test_mistakes_in_problems(make: Callable[[], Any], message: str) -> None:
             lambda model: next(ms.trace(model, "pressure", steps=0)),
             "trace: steps: 0: give a number from 1 on",
         ),
+        (
+            lambda model: ms.columns(model, Record("start", "", None).with_scene(ms.Model(FILE))),  # type: ignore[arg-type]
+            "columns: a record is of another model: give record.scene in place of the model",
+        ),
         (lambda model: ms.columns([], model), "columns: give the model first, then what follow"),
         (lambda model: ms.surface(model, model), "surface: give the model first, then what follow"),
     ],
@@ -360,3 +395,28 @@ def test_mistakes_in_problems(make: Callable[[], Any], message: str) -> None:
 def test_mistakes_with_a_model(plain: Any, use: Callable[[Any], Any], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         use(plain)
+
+
+def test_loads_are_changed_by_set_alone() -> None:
+    model = ms.Model(FILE)
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        model.amplitudes["pressure"] = 0.1  # type: ignore[index]
+    with pytest.warns(UserWarning, match=r"solve: all loads are 0 \(pressure\): give"):
+        record = model.solve()
+    assert record.amplitudes == model.amplitudes == {"pressure": 0}
+
+
+def test_units_of_a_field() -> None:
+    """Components in mT are those in tesla; over magnitudes they have none."""
+
+    def magnetic(*fields: Any, **keys: Any) -> Any:
+        problem = problem_of(
+            ms.Field(*fields, **keys), thickness="0.02 m", youngs_modulus="1 MPa", unit="m"
+        )
+        return problem.document.data["magnetic"]
+
+    assert magnetic([0, 0, "90 mT"], ["5 mT", 0, 0]) == magnetic([0, 0, 0.09], [0.005, 0, 0])
+    remanent = magnetic([0, "0.1*x", "90 mT"], [0, 0, 0.005])["remanent"]
+    assert remanent["components"] == ["0", "0.1*x", "0.09"]
+    with pytest.raises(ms.CaseError, match=r"'90 mT'\]: with lambda_m vectors are over their magn"):
+        magnetic([0, 0, "90 mT"], [0, 0, 1], lambda_m=0.01)

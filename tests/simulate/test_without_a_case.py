@@ -525,6 +525,10 @@ def test_the_program_of_the_howto_on_one_and_two_ranks(tmp_path: Path) -> None:
         ({"thickness": "25 m"}, "2 times as long as thickness"),
         ({"thickness": "2 mm", "unit": "m"}, ""),
         ({"radius": "25 mm", "thickness": "2 mm", "unit": "mm"}, ""),
+        (
+            {"radius": "10 m", "thickness": "2 mm", "unit": "mm"},
+            "mm, 0.005 times as long as radius, 10 m: give another unit, or leave the radius out",
+        ),
         ({"radius": "25 m", "thickness": "0.2 m"}, ""),
         ({"radius": 25, "thickness": 2}, ""),
         ({"radius": "-25 mm", "thickness": "2 m"}, ""),
@@ -545,5 +549,5 @@ def test_a_mesh_in_mm_is_not_in_metres(dome: Dome, sizes: dict[str, Any], messag
         return
     with pytest.raises(ms.CaseError) as error:
         ms.Shell(domain, **keys)
-    assert "shell.unit: is not given" in str(error.value)
+    assert ("shell.unit: is not given" in str(error.value)) == ("unit" not in sizes)
     assert message in str(error.value)

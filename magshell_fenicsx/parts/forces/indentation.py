@@ -43,7 +43,7 @@ LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
 
 class Place(Direction):
     """A direction from the centre of a hemisphere or cap, `polar: 0` of a pole, centre or tip; or a
-    named point.
+    named point, which alone a mesh takes.
     """
 
     point: str | None = None

@@ -50,7 +50,9 @@ from magshell_fenicsx.models.shell.residual import ParameterDerivative
 from magshell_fenicsx.models.shell.spatial_fields import (
     PlacementField,
     Uniform,
+    cell_geometry,
     fields_of_placement,
+    user_field_polynomials,
 )
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
@@ -137,7 +139,35 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
                 for rate in rates(model, field, normals)
             )
             forces = forces + np.stack(list(contracted), axis=1)[..., None]
-    return FieldGradient(f, forces, places, normals)
+    return FieldGradient(f, forces, places, normals, partial(_at_nodes, scene, f))
+
+
+def _at_nodes(scene: Scene, f: fem.Function, function: fem.Function) -> Array:
+    """Return a function on a program's mesh at the nodes of a field; collective.
+
+    Returns
+    -------
+    Array
+        (own cells, nodes of f, components of the function).
+
+    Raises
+    ------
+    ValueError
+        If the scene has no such mesh.
+    MeshError
+        If the function is on another mesh, or its degree is above that of the displacement.
+    """
+    surface, user_mesh = scene.model.midsurface, scene.user_mesh("along")
+    if not (surface and user_mesh):
+        raise ValueError(
+            "along: a function needs a shell on a dolfinx mesh: give values at gradient.places"
+        )
+    polynomials = user_field_polynomials(
+        user_mesh.field(function, "along"), surface, cell_geometry(scene.model.r0)
+    )
+    nodes = f.function_space.element.basix_element.points
+    table = polynomials.element.tabulate(0, nodes)[0, :, :, 0]
+    return np.asarray(np.matmul(table, polynomials.values[: polynomials.cells.owned]))
 
 
 def _refuse_without_derivative(adjoint: Adjoint, name: str) -> None:
