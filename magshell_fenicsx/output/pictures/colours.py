@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.contact_peak import ContactPeak
 from magshell_fenicsx.output.fields.surface import SHELL, Surface
-from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, from_zero
+from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, from_zero, round_limits
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
@@ -184,7 +184,7 @@ def stretches(surface: Surface) -> list[ColouredField]:
                 limits = from_zero(low, max(high, ZERO_STRESS["E_1"]))
                 fields.append(ColouredField(name, values, limits, SIGNED, caption))
             else:
-                limits = low, max(high, low + MIN_STRETCH_RANGE)
+                limits = round_limits(low, max(high, low + MIN_STRETCH_RANGE))
                 fields.append(ColouredField(name, values, limits, MAGNITUDE, caption))
     return fields
 

@@ -456,7 +456,7 @@ def draw_hidden(axes: "Axes", steps: Sequence[CurveStep]) -> None:
     for step in steps:
         draw_lines(inset, step)
     inset.set(xlim=box[:, 0], ylim=box[:, 1])
-    inset.tick_params(labelsize="x-small", length=2)
+    inset.tick_params(length=2)
     inset.locator_params(nbins=3)
     axes.indicate_inset_zoom(inset, edgecolor="0.4", linewidth=0.6)
 
@@ -551,7 +551,7 @@ def frequencies_figure(
     else:
         axes.set(xlabel=column.label if column else "")
     if waves not in ([""], ["waves"]):  # one wave alone needs no legend
-        figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
+        figure.legend(title="wave", frameon=False, loc="outside right upper")
     return figure
 
 

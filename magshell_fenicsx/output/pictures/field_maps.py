@@ -36,6 +36,7 @@ MIN_IN_PLANE_PART = 1e-6  # of |B|: a smaller part in the plane has no lines
 MARGIN = 1.5  # inches of a panel above and below its map: title, axis, colours
 MAP_WIDTH, MAX_MAP_HEIGHT = 0.78, 2.0  # over a panel's width
 PARALLEL = 1 - 1e-12  # least cosine of parallel directions
+NEIGHBOUR_DISTANCE = 1.5  # cells: of a neighbour, also across a corner
 LINE_DENSITY = 1.2  # of field lines, as matplotlib counts it
 LENGTH_TOLERANCE = 1e-7  # relative: a line without length, where a corner is on the plane
 LINE_WIDTH = 0.6  # points: around the section of the shell, whose thickness is true
@@ -80,7 +81,8 @@ def field_maps_figure(
         )
         grid_of_axes = figure.subplots(row_count, panels_per_row, squeeze=False).ravel()
         for axes, (grid, R) in zip(grid_of_axes, shown_maps, strict=False):
-            _draw(axes, plane_of(grid), R, surface, h, case)
+            plane = plane_of(grid)
+            _draw(axes, plane, R, surface, h, case, with_name=len(shown_maps) > 1)
         for axes in grid_of_axes[len(shown_maps) :]:
             axes.set_axis_off()
     return figure
@@ -103,7 +105,14 @@ def section(surface: Surface, grid: MapGrid) -> Array:
 
 
 def _draw(
-    axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, case: Mapping[str, Any]
+    axes: "Axes",
+    grid: MapGrid,
+    R: float,
+    surface: Surface,
+    h: float,
+    case: Mapping[str, Any],
+    *,
+    with_name: bool,
 ) -> None:
     """Draw the field on a plane grid in axes, with the section of the shell.
 
@@ -115,6 +124,8 @@ def _draw(
         Thickness over R.
     case
         The case of summary.json.
+    with_name
+        Whether the title has the name of the map, which tells it from others.
     """
     # factor from values of B in the grid to the drawn unit, and its name
     size_of_unit, unit = unit_of(case)
@@ -129,13 +140,16 @@ def _draw(
     B = size_of_unit * grid.values.reshape(ny, nx, 3)
     magnitude = np.linalg.norm(B, axis=-1)
     norm, largest, is_logarithmic = _colour_norm(magnitude)
-    image = axes.pcolormesh(x, y, masked(magnitude), norm=norm, cmap="viridis", shading="nearest")
+    image = axes.pcolormesh(
+        x, y, masked(_without_steps(magnitude)), norm=norm, cmap="viridis", shading="nearest"
+    )
     _draw_field_lines(axes, x, y, [B @ e for e in directions], largest)
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.set(xlabel=_direction(directions[0], R), ylabel=_direction(directions[1], R))
     place = _place(grid, directions, length_of_R, R)
-    axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{place}")
+    name = f"{grid.name.replace('_', ' ')}\n" if with_name else ""
+    axes.set_title(f"{name}{grid.words} field{place}")
     bar = axes.figure.colorbar(
         image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05
     )
@@ -143,6 +157,20 @@ def _draw(
         bar.ax.xaxis.set_major_formatter(number_format())
     plane_lines = length_of_R * np.stack([lines @ e for e in directions], axis=-1)
     _draw_section(axes, plane_lines, length_of_R * h, is_body=surface.is_body)
+
+
+def _without_steps(values: Array) -> Array:
+    """Return values (ny, nx) whose nan have the nearest value, where that is at a neighbour.
+
+    So no steps of white cells are beside the section of the shell, in which there is no value.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    is_absent = np.isnan(values)
+    if is_absent.all() or not is_absent.any():
+        return values
+    distance, (rows, columns) = distance_transform_edt(is_absent, return_indices=True)
+    return np.where(distance <= NEIGHBOUR_DISTANCE, values[rows, columns], np.nan)
 
 
 def _draw_field_lines(

@@ -155,8 +155,8 @@ def drawing(style: OutputSection) -> AbstractContextManager[None]:
         "legend.fontsize": font_size,
     }
     settings |= {
-        "xtick.labelsize": 0.9 * font_size,
-        "ytick.labelsize": 0.9 * font_size,
+        "xtick.labelsize": font_size,
+        "ytick.labelsize": font_size,
         "axes.linewidth": 0.6,
     }
     # text stays text; a fixed salt makes equal pictures equal files
@@ -220,7 +220,7 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     directions(directions_axes, panels[0].camera, style)
     for k, text in enumerate(reversed(note_lines)):
         text_place = boxes.place(indent, (k + 0.5) * line_height)
-        figure.text(*text_place, text, va="center", fontsize=0.9 * style.font_size)
+        figure.text(*text_place, text, va="center", fontsize=style.font_size)
     return figure
 
 
@@ -302,7 +302,7 @@ def _draw_section(
     section.draw(boxes.axes(middle - width / 2, low, width, height))
     place = boxes.place(middle, low - 0.9 * cell.line_height)
     words = f"section {section.words}; grey: undeformed"
-    boxes.figure.text(*place, words, ha="center", va="center", fontsize="small")
+    boxes.figure.text(*place, words, ha="center", va="center")
 
 
 def _draw_names_of_arrows(
@@ -395,7 +395,7 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
             va="center",
             color="white",
             weight="bold",
-            fontsize=0.9 * style.font_size,
+            fontsize=style.font_size,
         )
     for x, y, name in panel.names:
         halo = [withStroke(linewidth=0.25 * style.font_size, foreground="white")]
@@ -406,7 +406,7 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
             ha="center",
             va="center",
             color="0.1",
-            fontsize=0.9 * style.font_size,
+            fontsize=style.font_size,
             path_effects=halo,
         )
     axes.set(xlim=(left, right), ylim=(low, high))

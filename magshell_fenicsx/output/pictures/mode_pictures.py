@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.mode_fields import mode_caption, mode_file, wave_number
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_vtu
-from magshell_fenicsx.output.pictures.captions import named_value
+from magshell_fenicsx.output.pictures.captions import in_mathematics, named_value
 from magshell_fenicsx.output.pictures.colours import ColouredField
 from magshell_fenicsx.output.pictures.layout import (
     GAP,
@@ -111,7 +111,7 @@ def small_panels(
     figure = Figure(figsize=(width, height), dpi=style.dpi)
     boxes = FigureBoxes(figure)
     text_place = boxes.place(gap / 2, 0.5 * line_height)
-    figure.text(*text_place, note, va="center", fontsize=0.9 * style.font_size)
+    figure.text(*text_place, note, va="center", fontsize=style.font_size)
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
         # the window is given, so that the width of the picture does not count
         panel = Background(surface, camera, width=0, window=window).panel(layer, style)
@@ -187,9 +187,11 @@ def solutions_figure(
         for surface in surfaces
     ]
     captions = list[str]()
-    for row in rows:
+    for row, surface in zip(rows, surfaces, strict=True):
         stable_or_unstable, *_ = stability(row).split()  # the first word
-        captions.append(f"{_name(row)}: {stable_or_unstable}")
+        largest = float(surface.w[np.abs(surface.w).argmax()]) / h
+        words = f"largest $w/h$ = {in_mathematics(largest, 4)}"
+        captions.append(f"{_name(row)}: {stable_or_unstable}\n{words}")
     with drawing(style):
         return small_panels(surfaces, layers, captions, style, camera)
 
@@ -200,6 +202,9 @@ def _name(row: Row) -> str:
 
 
 MODE_SIZE = 0.05  # drawn size of a mode's largest displacement, over R
+MAX_CLOSED = 0.5  # of a gap between two parts, that a drawn mode closes
+MIN_CLOSING = 0.1  # of a mode, of largest length one: less closes no gap
+MIN_GAP = 1e-4  # over R: nearer parts touch, and the mode does not part them
 MAX_PANELS = 12
 CAPTION = "$w$ of the mode over its largest, of any sign"
 
@@ -227,7 +232,8 @@ def modes_figure(
     note = f"The first {max_panels} of {len(captions)} modes." if len(captions) > max_panels else ""
     surfaces, captions = surfaces[:max_panels], captions[:max_panels]
     with_modes = [
-        replace(surface, u=surface.u + MODE_SIZE * surface.fields["mode"]) for surface in surfaces
+        replace(surface, u=surface.u + mode_size(surface) * surface.fields["mode"])
+        for surface in surfaces
     ]
     layers = []
     for surface in surfaces:
@@ -237,6 +243,49 @@ def modes_figure(
         )
     with drawing(style):
         return small_panels(with_modes, layers, captions, style, camera, note)
+
+
+def mode_size(surface: Surface) -> float:
+    """Return the drawn size of a mode over R: with it no part of the shell goes through another.
+
+    It is `MODE_SIZE`, or less where the mode closes the gap between parts that share no node.
+
+    Parameters
+    ----------
+    surface
+        Deformed surface with the field "mode" (n, 3), of largest length one.
+    """
+    from scipy.spatial import cKDTree
+
+    part_numbers, size = _part_numbers(surface), MODE_SIZE
+    r, mode = surface.r0 + surface.u, surface.fields["mode"]
+    for number in range(1, int(part_numbers.max()) + 1):
+        own_nodes, earlier_nodes = (
+            np.flatnonzero(mask) for mask in (part_numbers == number, part_numbers < number)
+        )
+        gaps, nearest = cKDTree(r[earlier_nodes]).query(r[own_nodes])
+        other_nodes = earlier_nodes[nearest]
+        directions = (r[other_nodes] - r[own_nodes]) / np.maximum(gaps, MIN_GAP)[:, None]
+        closing = np.sum((mode[own_nodes] - mode[other_nodes]) * directions, axis=1)
+        closes = (closing > MIN_CLOSING) & (gaps > MIN_GAP)
+        size = min(size, MAX_CLOSED * (gaps[closes] / closing[closes]).min(initial=np.inf))
+    return float(size)
+
+
+def _part_numbers(surface: Surface) -> NDArray[np.int64]:
+    """Return for each node (n,) the number of its part: parts share no node; 0 for one shell."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    if len(surface.shells) < 2:
+        return np.zeros(len(surface.r0), np.int64)
+    # each node of a cell is connected with the first one
+    nodes = surface.cells[:, 1:].ravel()
+    first_nodes = np.repeat(surface.cells[:, 0], surface.cells.shape[1] - 1)
+    node_count = len(surface.r0)
+    graph = coo_matrix((np.ones(len(nodes)), (first_nodes, nodes)), (node_count, node_count))
+    _, numbers = connected_components(graph, directed=False)
+    return np.asarray(numbers, np.int64)
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 FIELDS_WITH_NAMES = ("", "w_over_h")  # names of fields whose pictures name the shells
+PICTURES_WITH_BODIES = ("shell", "fields", "contact")  # the others show the shell alone
 GREY = 0.93  # of a surface without colours
 END_TOLERANCE = 0.01  # of a bar's length: values no farther beyond its ends are those of the ends
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
@@ -129,7 +130,8 @@ def figures(
     names
         Keys of `PICTURES` to draw; all of them by default.
     """
-    drawn_figures, views = {}, dict[int, Background]()
+    drawn_figures, views = {}, dict[tuple[int, bool], Background]()
+    has_bodies = bool(near_places(surface))
     for name in names or PICTURES:
         content = PICTURES[name](surface, h)
         if not content.layers:
@@ -139,9 +141,11 @@ def figures(
             window = Window.around(camera(content.detail), width)
             view = Background(surface, camera, width, window)
         else:  # panels of one width are all painted on one view
-            if width not in views:
-                views[width] = Background(surface, camera, width)
-            view = views[width]
+            key = width, has_bodies and name in PICTURES_WITH_BODIES
+            if key not in views:
+                seen_surface = surface if key[1] else replace(surface, outlines=(), solids=())
+                views[key] = Background(seen_surface, camera, width)
+            view = views[key]
         with drawing(style):
             panels = [view.panel(layer, style) for layer in content.layers]
             if name == "shell":

@@ -24,6 +24,10 @@ FAR_GREY = "0.86"
 COLOURS = 257  # of a colour map
 END_DISTANCE = 0.16  # of a bar: ticks nearer to its ends give way to the numbers there
 END_DISTANCE_IN_LETTERS = 3.2  # the same on a short bar, in heights of a letter
+MAX_INTERVALS, STEPS = 5, (1, 2, 5, 10)  # between ticks of a bar
+STEP_TOLERANCE = 1e-9  # of logarithms
+MAX_DECIMALS = 5  # after the first digit of the largest number
+DIGIT_WIDTH = 0.55  # of a number at a bar, in heights of a letter
 SHORT_BAR = 16  # heights of a letter
 PALENESS = 0.76  # part of matplotlib's colours in use: the others are darker than shade
 WHITE_ZONE = 0.1  # of the colour map around zero that is made lighter
@@ -95,6 +99,20 @@ def from_zero(low: float, high: float, min_fraction: float = 0.01) -> tuple[floa
     return lower, upper
 
 
+def round_limits(low: float, high: float) -> tuple[float, float]:
+    """Return colour limits around two values, that are multiples of the step of the bar's ticks.
+
+    Examples
+    --------
+    >>> round_limits(1.048, 1.153)
+    (1.04, 1.16)
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ticks = MaxNLocator(MAX_INTERVALS, steps=STEPS).tick_values(low, high)
+    return float(ticks[0]), float(ticks[-1])
+
+
 def colour_bar(
     figure: "Figure",
     axes: "Axes",
@@ -134,6 +152,17 @@ def colour_bar(
     low, high = scale.limits
     inner_ticks = _inner_ticks(low, high, letters=length if is_short else None)
     texts, power = numbers([low, *inner_ticks, high])  # power is their common power of ten
+    if orientation == "horizontal":  # texts of inner ticks beside those at the ends
+        is_apart = [
+            all(
+                abs(tick - end) / (high - low) * length > _distance_of_texts(text, texts[i])
+                for end, i in ((low, 0), (high, -1))
+            )
+            for tick, text in zip(inner_ticks, texts[1:-1], strict=True)
+        ]
+        inner_ticks = [tick for tick, apart in zip(inner_ticks, is_apart, strict=True) if apart]
+        inner_texts = [text for text, apart in zip(texts[1:-1], is_apart, strict=True) if apart]
+        texts = [texts[0], *inner_texts, texts[-1]]
     bar = figure.colorbar(
         ScalarMappable(Normalize(*scale.limits), colour_map(scale.colours, scale.limits)),
         cax=axes,
@@ -146,10 +175,15 @@ def colour_bar(
         bar.set_label(f"{scale.caption}  ({power})" if power else scale.caption)
         return
     if power:  # beside the bar, where it meets no number
-        bar.ax.text(1.07, 0.5, power, transform=bar.ax.transAxes, va="center", fontsize="small")
+        bar.ax.text(1.07, 0.5, power, transform=bar.ax.transAxes, va="center")
     title = bar.ax.set_title(scale.caption, pad=3)
     if np.isfinite(room):
         _fit_into(title, room, figure)
+
+
+def _distance_of_texts(text: str, other: str) -> float:
+    """Return the least distance of the middles of two numbers, in heights of a letter."""
+    return DIGIT_WIDTH * (len(text) + len(other)) / 2 + DIGIT_WIDTH
 
 
 def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
@@ -164,11 +198,11 @@ def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
     """
     from matplotlib.ticker import MaxNLocator
 
-    max_intervals, end_distance = 5, END_DISTANCE
+    max_intervals, end_distance = MAX_INTERVALS, END_DISTANCE
     if letters is not None:
         max_intervals = 3
         end_distance = max(END_DISTANCE, END_DISTANCE_IN_LETTERS / letters)
-    ticks = MaxNLocator(max_intervals, steps=[1, 2, 5, 10]).tick_values(low, high)
+    ticks = MaxNLocator(max_intervals, steps=STEPS).tick_values(low, high)
     return [tick for tick in ticks if end_distance < (tick - low) / (high - low) < 1 - end_distance]
 
 
@@ -204,8 +238,11 @@ def numbers(values: Sequence[float]) -> tuple[list[str], str]:
     largest = max(map(abs, values)) or 1.0
     order = int(np.floor(np.log10(largest)))  # exponent of ten of the largest number
     power = 0 if -2 <= order < 4 else order  # numbers such as 0.01 and 9999 are written plainly
-    # three digits of the largest number, and no more decimals of the others
-    texts = [f"{round(v / 10.0**power, 2 - order + power):.10g}" for v in values]
+    # three digits of the largest number, or as many as tell the numbers apart by a hundredth
+    steps = np.diff(sorted(set(values)))
+    digits = max(2, order - int(np.floor(np.log10(steps.min(initial=largest)) + STEP_TOLERANCE)))
+    digits = min(digits, MAX_DECIMALS)
+    texts = [f"{round(v / 10.0**power, digits - order + power):.10g}" for v in values]
     texts = [text if text.strip("-0.") else "0" for text in texts]  # also of a negative zero
     power_of_ten = rf"$\times 10^{{{power}}}$" if power else ""
     return [text.replace("-", "−") for text in texts], power_of_ten

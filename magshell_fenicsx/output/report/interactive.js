@@ -181,15 +181,24 @@
     });
     const numbers = {}; about.points.map((_, i) => i).filter(isLocated).forEach((i, n) => { numbers[i] = n + 1; });
     const marked = [...within].filter(isLocated), wide = Math.max(...x) - Math.min(...x) || 1, tall = Math.max(...y) - Math.min(...y) || 1;
-    const beside = i => { // a number stands away from the nearest other mark
-      const away = j => Math.hypot((x[j] - x[i]) / wide, (y[j] - y[i]) / tall), others = marked.filter(j => j !== i);
+    const away = (i, j) => Math.hypot((x[j] - x[i]) / wide, (y[j] - y[i]) / tall), groups = [];
+    for (const i of marked) { // marks that lie on each other have one text, at the first of them
+      const group = groups.find(g => away(g[0], i) < 0.03);
+      group ? group.push(i) : groups.push([i]);
+    }
+    const text = i => {
+      const some = (groups.find(g => g[0] === i) || []).map(j => numbers[j]), last = some.length - 1;
+      return last > 1 && some[last] - some[0] === last ? `${some[0]}–${some[last]}` : some.join(", ");
+    };
+    const beside = i => { // a number stands away from the nearest other text
+      const others = groups.map(g => g[0]).filter(j => j !== i);
       if (!others.length) return "top left";
-      const j = others.reduce((a, b) => away(b) < away(a) ? b : a);
+      const j = others.reduce((a, b) => away(i, b) < away(i, a) ? b : a);
       return `${y[j] > y[i] ? "bottom" : "top"} ${x[j] > x[i] ? "left" : "right"}`;
     };
     for (const [kind, symbol] of [["fold", "circle-open"], ["bifurcation", "diamond-open"]]) {
       const here = [...within].filter(i => about.labels[i] === kind);
-      if (here.length) traces.push({x: here.map(i => x[i]), y: here.map(i => y[i]), customdata: here, mode: "markers+text", text: here.map(i => `${numbers[i]}`), textposition: here.map(beside),
+      if (here.length) traces.push({x: here.map(i => x[i]), y: here.map(i => y[i]), customdata: here, mode: "markers+text", text: here.map(text), textposition: here.map(beside),
         marker: {size: 7, symbol, color: "#d62728", line: {width: 1.5}}, hovertemplate: here.map(hover), ...once(kind)});
     }
     const found = [...within].filter(i => about.labels[i] === "solution");

@@ -33,8 +33,10 @@ LEGEND: Mapping[str, Any] = {
     "loc": "upper left",
     "bbox_to_anchor": (1.0, 1.0),
 }
-# parts of the picture's width: in a narrower region only its mode is written, or outside of it
-NARROW, LOW = 0.25, 0.08
+# over the range of the key: in a narrower region only its mode is written; names whose middles are
+# nearer are in two rows, of which each has its distance from the limit of the axis, over the axis
+NARROW, NEAR, ROWS = 0.25, 0.2, (0.05, 0.12)
+MIN_CONTOURED, LEVELS = 3, 8  # values of the second key, and levels of contours
 Row = Mapping[str, Any]
 
 
@@ -134,7 +136,8 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
         plot.legend(**LEGEND, title=names[1], title_fontsize=8)
         if with_plane:
             _plane(plane, rows, content, values_without_boundary)
-            plane.set(xlabel=names[0], ylabel=names[1], title="where it loses its stability")
+            title = f"{quantity(amplitude(content['load']).column).words} at the instability"
+            plane.set(xlabel=names[0], ylabel=names[1], title=title)
             plane.legend(**LEGEND)
 
 
@@ -152,9 +155,11 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
 def _plane(
     plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
 ) -> None:
-    """Draw where the case is unstable in the plane of both keys, a line for each second value.
+    """Draw the load of the instability in the plane of both keys.
 
-    Lines are coloured by the load; dotted lines are values without an instability.
+    Contours join points of equal load, where three second values or more have a boundary; of fewer
+    each has a line. Other lines are second values at which another load leads to the instability,
+    dotted ones those without an instability.
 
     Parameters
     ----------
@@ -164,6 +169,7 @@ def _plane(
         Values of the second key without a boundary.
     """
     load_words = set[str]()
+    has_contours = _load_contours(plane, rows, content)
 
     def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:
         """Draw a line at a value of the second key; each text is in the legend once."""
@@ -176,11 +182,35 @@ def _plane(
         line = [*group]
         load_quantity = quantity(amplitude(line[0]["amplitude"]).column).words
         # another colour where another load leads to the instability
-        colour = "C0" if line[0]["amplitude"] == content["load"] else "C1"
+        is_main_load = line[0]["amplitude"] == content["load"]
+        if is_main_load and has_contours:
+            plane.plot([row["key"] for row in line], [value] * len(line), ".", color="0.5", ms=2)
+            continue
+        colour = "C0" if is_main_load else "C1"
         draw([row["key"] for row in line], value, f"by the {load_quantity}", color=colour, lw=2)
     for value in empty:
         draw(content["range"], value, "nowhere", color="0.5", ls=":")
     _marks(plane, "second", rows)
+
+
+def _load_contours(plane: Any, rows: Sequence[Row], content: Mapping[str, Any]) -> bool:
+    """Draw contours of the load over both keys; return whether there are enough points for them."""
+    from matplotlib.tri import Triangulation
+
+    points = [row for row in rows if row["amplitude"] == content["load"]]
+    x, y, load = (
+        np.array([row[name] for row in points], float) for name in ("key", "second", "load")
+    )
+    if len(set(y)) < MIN_CONTOURED or not np.ptp(x) or not np.ptp(load):
+        return False
+    # triangles between points, in axes of equal extents
+    triangles = Triangulation(x / np.ptp(x), y / np.ptp(y)).triangles
+    filled = plane.tricontourf(x, y, triangles, load, levels=LEVELS, cmap="viridis", alpha=0.6)
+    lines = plane.tricontour(
+        x, y, triangles, load, levels=filled.levels, colors="0.2", linewidths=0.8
+    )
+    plane.clabel(lines, fontsize=8)
+    return True
 
 
 def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
@@ -269,6 +299,7 @@ def _regions(
     # the stable regions of the whole boundary, and the region beyond each mode's part of it
     extent = np.ptp([row["key"] for row in rows])
     regions = [(x, y, words) for x, y, words in all_regions if words == "stable"]
+    last_x, row_number = -np.inf, 0
     for mode, part in mode_parts:
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
@@ -278,10 +309,13 @@ def _regions(
             continue
         x, y, words = regions_of_part[0]  # the first one is beyond the boundary
         width = np.ptp([row["key"] for row in part]) / extent
-        # the name over a narrow part stands nearer to the limit of the axis, beside the names of
-        # its neighbours
-        outer = limits[1] if y > 0 else limits[0]
-        y = (y + outer) / 2 if width < LOW else y
+        # near to the limit of the axis no name lies on the boundary; neighbours that are narrow
+        # are in two rows
+        outer, inner = limits if y < 0 else limits[::-1]
+        is_near = abs(x - last_x) < NEAR * extent
+        row_number = 1 - row_number if is_near else 0
+        last_x = x
+        y = outer + (ROWS[row_number]) * (inner - outer)
         regions.append((x, y, mode if width < NARROW and mode else words))
     return regions
 

@@ -178,7 +178,7 @@ def _draw_history(
             [np.nan if row[result] is None else row[result] for row in rows], dtype=float
         )
         # the first lines are wider, so that lines that lie on each other are all seen
-        colour, line_width = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)
+        colour, line_width = f"C{i}", 1.2 + 0.8 * min(len(results) - 1 - i, 3)
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         # the line of the best goes on to the last evaluation
         evaluation_numbers = np.append(number[best], number[-1:] if best.any() else [])

@@ -91,7 +91,9 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     plane_axes = sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2])
     has_labels = False
     # one shape for each state of the shell; the legend names the first one alone
-    for _, rows_of_shape in groupby(sorted(rows, key=_state_of), key=_state_of):
+    states = groupby(sorted(rows, key=_state_of), key=_state_of)
+    rows_of_states = [(state, [*rows_of_state]) for state, rows_of_state in states]
+    for state, rows_of_shape in rows_of_states:
         rows_by_point = _rows_by_point(rows_of_shape)
         rows_of_axes = [rows_by_point.get(axis, {}) for axis in plane_axes]
         # the points that have both displacements
@@ -112,6 +114,11 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
                 lw=1.2,
             )
         has_labels = True
+        if len(rows_of_states) > 1:  # the last one of the drawn curves is that of the measurement
+            x, y = (values[-1] for values in np.array(coordinates) + np.array(u))
+            plot.annotate(
+                _state_words(state), (x, y), (3, 3), textcoords="offset points", fontsize=8
+            )
     # the undeformed places, once
     plot.plot(
         *coordinates,
@@ -154,6 +161,16 @@ def _rows_by_point(rows: Iterable[Row]) -> dict[str, dict[str, Row]]:
 def _state_of(row: Row) -> tuple[str, str]:
     """Return settings and place of a row, which say at which state of the shell it is."""
     return str(row["settings"]), str(row["at"])
+
+
+def _state_words(state: tuple[str, str]) -> str:
+    """Return the settings and the place of a state in words."""
+    settings, place = state
+    words = []
+    for setting in settings.split("; "):
+        key, _, value = setting.partition("=")
+        words.append(f"{key_words(key)} = {value}" if value else key)
+    return ", ".join(text for text in (*words, "" if place == "end" else place) if text)
 
 
 def _in_line(coordinates: Sequence[Sequence[float]]) -> bool:
