@@ -8,6 +8,7 @@ polynomial with their tangents goes through.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
@@ -18,12 +19,13 @@ MIN_FRACTION_OF_STEP = 0.01  # of a planned step that ends behind a target
 MAX_PREDICTORS = 4  # points that a polynomial goes through
 # least distance of these points, over the distance of the two points around a target
 MIN_PREDICTOR_DISTANCE = 0.1
+ROUNDING_OF_TARGET = 1e-4  # in lengths: smaller distances tell no branches apart
 MAX_TRIALS = 20
 ZERO_TOLERANCE = 1e-6  # of the bracket that is left: nearer places are the same
 
 
 class TargetMissed(PathStopped):
-    """The solve at a requested point between two points of the path failed."""
+    """The solve at a requested point between two points failed, or left the branch."""
 
 
 def end_near_last_target(
@@ -132,6 +134,10 @@ def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point
     point = path.solve(path.prescribed(quantity, target), s, guess, stress, neighbour=neighbour)
     if isinstance(point, str):
         raise TargetMissed(f"a requested point cannot be found: {point}", low)
+    # with a prescribed load or displacement Newton's method may end on another branch. The tangents
+    # of both ends tell how far the path goes between them
+    if path.are_apart(low, replace(high, state=point.state), ROUNDING_OF_TARGET):
+        raise TargetMissed("a requested point was found on another branch", low)
     return point
 
 

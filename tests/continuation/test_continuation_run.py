@@ -2,6 +2,7 @@
 form.
 """
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -20,6 +21,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepOptions, StepTooLong
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.targets import TargetMissed, targets_between
 
 K, C = 0.4, 1.9
 FOLDS = 1 - 1 / np.sqrt(3), 1 + 1 / np.sqrt(3)
@@ -385,3 +387,17 @@ def test_a_search_that_may_not_go_on_tells_what_it_knows() -> None:
     load = point.state.mu["load"]
     assert load < fold < load + point.load_error < load + 0.1
     assert walk.path.solves < 20
+
+
+def test_a_target_on_another_branch_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Newton's method at a prescribed load may jump to where the tangents of the path do not lead,
+    as through a body: the step is then repeated in shorter ones."""
+    path, start = begin()
+    (_, low), (_, high) = islice(ContinuationRun(path, start, ContinuationGoal("points")), 2)
+    load = (low.state.mu["load"] + high.state.mu["load"]) / 2
+    ((_, point),) = targets_between(path, "load", [load], 1.0, [low, high])
+    assert low.state.u[1] < point.state.u[1] < high.state.u[1]
+    far_state = State(point.state.u + 5.0, point.state.mu)
+    monkeypatch.setattr(path, "solve", lambda *_, **__: replace(point, state=far_state))
+    with pytest.raises(TargetMissed, match="another branch"):
+        list(targets_between(path, "load", [load], 1.0, [low, high]))
