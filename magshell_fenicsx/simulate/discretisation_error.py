@@ -9,6 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.quantities.registry import AMPLITUDES, amplitude
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -27,6 +30,7 @@ SAFETY = 1.25  # factor of the change by one degree more, for the error
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 LATER = "limit_load_"  # before the number of an instability after the first
 LATER_TAKE_LONG = "this and later instabilities have no estimate, as it would take long"
+PRESSURE_MAX = "contact_pressure_max"  # column of path.csv, and the begin of others
 MOST_INSTABILITIES = 4  # of a path on a meridian, whose errors are estimated
 
 
@@ -149,6 +153,7 @@ def estimate_errors(
             estimates.errors |= {
                 f"{column}@end": _estimated(change) for column, change in changes.items() if change
             }
+            _leave_out_narrow_pressure(estimates, end.scene or scene, end.point.state)
     steps = scene.problem.programme
     if steps and steps[-1].until == "zero" and history.begin and history.last:
         with estimates.naming("barrier"):
@@ -198,6 +203,19 @@ def frequency_errors(
             errors[f"omega2_{number}"] = _estimated(change)
         ranks[mode.label] += 1
     return errors
+
+
+def _leave_out_narrow_pressure(estimates: ErrorEstimates, scene: Scene, state: State) -> None:
+    """Leave out the errors of largest pressures where no cell is in contact all over; collective.
+
+    There the pressure falls with the width of the contact, which one degree more does not show.
+    """
+    names = [name for name in estimates.errors if name.startswith(PRESSURE_MAX)]
+    if not names or scene.comm.allreduce(scene.model.cells_evenly_pressed(state).any(), MPI.LOR):
+        return
+    for name in names:
+        del estimates.errors[name]
+    estimates.reasons[f"{PRESSURE_MAX}@end"] = "the contact is narrower than a cell of the mesh"
 
 
 def _estimated(change: float, load_error: float = 0.0) -> float:

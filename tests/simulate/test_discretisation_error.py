@@ -129,6 +129,15 @@ def test_force_at_a_depth() -> None:
     assert result.errors.get("w_over_h@end", 0.0) < 1e-12
 
 
+def test_a_narrow_contact_has_no_estimate_of_its_pressure() -> None:
+    """Under the edge of a rod the largest pressure grows with each finer mesh; the force does not."""
+    result = coarse_run("rod_contact.yaml", "loading.approach=1", "loading.points=1")
+    assert "force@end" in result.errors
+    assert not any("pressure_max" in name for name in result.errors)
+    reason = result.error_estimates.reasons["contact_pressure_max@end"]
+    assert reason == "the contact is narrower than a cell of the mesh"
+
+
 def test_critical_field_and_displacement_beyond_it() -> None:
     result = coarse_run("bistable_dome.yaml")
     assert result.critical_field
