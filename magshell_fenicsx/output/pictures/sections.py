@@ -86,7 +86,7 @@ def upright_section(surface: Surface) -> UprightSection | None:
         for section in sections
         if min(_length(section.undeformed), _length(section.deformed)) > MIN_LENGTH * extent
     ]
-    return max(long_sections, key=_height, default=None)
+    return max(long_sections, key=_height) if long_sections else None
 
 
 def _length(lines: Array) -> float:
