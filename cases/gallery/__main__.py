@@ -185,15 +185,15 @@ def _add_shapes(folder: Path) -> None:
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters
-    stay legible.
+    """A picture of one column of a paper has WIDTH pixels, a wider one half as many more: its
+    letters stay legible.
     """
     with Image.open(source) as opened:
         wide, picture = (
             opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN,
             opened.convert("RGB"),
         )
-    picture.thumbnail((WIDTH * (2 if wide else 1), 10 * WIDTH))
+    picture.thumbnail((WIDTH * 3 // 2 if wide else WIDTH, 10 * WIDTH))
     picture.save(target, optimize=True)
 
 

@@ -57,7 +57,7 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
         mode_parts = [part for _, part in _by_mode(rows)]
         for smooth_part in mode_parts:
             _dashed_line(plot, smooth_part)
-        plot.margins(y=0.2 if len(mode_parts) > 1 else None)
+        plot.margins(y=0.3 if len(mode_parts) > 1 else None)
         _marks(plot, "load", rows)
         for x, y, region_name in _regions(rows, content, plot.get_ylim()):
             plot.annotate(region_name, (x, y), ha="center", va="center", color="0.35")

@@ -117,7 +117,12 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
         if len(rows_of_states) > 1:  # the last one of the drawn curves is that of the measurement
             x, y = (values[-1] for values in np.array(coordinates) + np.array(u))
             plot.annotate(
-                _state_words(state), (x, y), (3, 3), textcoords="offset points", fontsize=8
+                _state_words(state),
+                (x, y),
+                (-6, 3),
+                textcoords="offset points",
+                ha="right",
+                fontsize=8,
             )
     # the undeformed places, once
     plot.plot(
