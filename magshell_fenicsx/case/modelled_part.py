@@ -11,6 +11,7 @@ imperfection grows if a load step multiplies it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -154,18 +155,23 @@ def _inner_line_constraints(case: Case, outline: Outline) -> list[SymmetryConstr
     file onto no other, or contain it.
     """
     names = {*case.boundary.conditions(), *(load.edge for load in _dead_loads(case) if load.edge)}
-    several = case.several
-    joined_edges = {name for edges in several.joints for name in edges} if several else set[str]()
+    joined_edges = set[str]()
+    if case.several:
+        shells = {member.name for member in case.several.parts}
+        # the edge of a T-junction, on a shell, stays an edge
+        pairs_of_edges = [edges for edges in case.several.joints if edges[1] not in shells]
+        joined_edges = {name for edges in pairs_of_edges for name in edges}
+    curves = cache(lambda: _curves_of_mesh_files(case, outline))  # reads files, once
 
-    def any_curve(plane: Mirror) -> bool:
-        """Return whether no curve within a mesh file is named."""
-        return names.isdisjoint(_curves_of_mesh_files(case, outline))
+    def names_no_curve(plane: Mirror) -> bool:
+        """Return whether no curve within a mesh file is held or loaded, whatever the plane."""
+        return names.isdisjoint(curves())
 
     reason = None
     if joined := sorted(names & joined_edges):
         reason = f"{joined[0]}: is a joined edge that is held or loaded, which needs a surface"
-    has_files = several is not None or isinstance(case.shell, MeshSurface)
-    return [SymmetryConstraint(reason, mirrors=any_curve)] if has_files else []
+    may_have_lines = case.several is not None or isinstance(case.shell, MeshSurface)
+    return [SymmetryConstraint(reason, mirrors=names_no_curve)] if may_have_lines else []
 
 
 def _curves_of_mesh_files(case: Case, outline: Outline) -> set[str]:

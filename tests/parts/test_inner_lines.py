@@ -38,7 +38,7 @@ def joined(load: dict[str, Any], line: Any = "free", **further: Any) -> Case:
     })  # fmt: skip
 
 
-def from_file(folder: Path, load: dict[str, Any], **boundary: Any) -> Case:
+def from_file(folder: Path, load: dict[str, Any], model: str = "shell", **boundary: Any) -> Case:
     """The same plate in a mesh file, hinged at all free edges but those that `boundary` names."""
     file = write(folder / "plate.msh", HALVES, joined=True)
     sides = dict.fromkeys(("a_1", "a_3", "a_4", "b_1", "b_2", "b_3"), "hinged")
@@ -47,7 +47,7 @@ def from_file(folder: Path, load: dict[str, Any], **boundary: Any) -> Case:
         "boundary": {**boundary, **sides},
         "points": {"middle": [0.25, 0.5, 0], "edge": [0.5, 0.5, 0]},
         "loading": {"kind": "dead", "loads": [load], "factor": 1, "control": "load", "points": 1},
-        "reactions": True,
+        "model": model, "reactions": True,
     })  # fmt: skip
 
 
@@ -115,3 +115,6 @@ def test_a_line_is_not_clamped_or_halved(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="edge: a_2: is a line within the surface"):
         Scene(from_file(tmp_path, {"edge": "a_2", "moment": 1}))
     assert Scene(from_file(tmp_path, {"edge": "a_2", "force": [0, 0, 1]})).model.multiplicity == 1
+    solid = from_file(tmp_path, {"over": "all", "pressure": 1}, model="solid", a_2="hinged")
+    with pytest.raises(MeshError, match=r"boundary\.a_2: the surface has no such edge"):
+        solid.problem().triangulated()
