@@ -207,6 +207,7 @@ def _surface_lines(patch: PatchMesh) -> list[str]:
     return [
         f"extent over the radius: {' x '.join(f'{side:.4g}' for side in extent)}",
         f"edges: {', '.join(patch.edges) or 'none'}; patches: {', '.join(patch.patches) or 'none'}",
+        *([f"lines within: {', '.join(patch.inner_lines)}"] if patch.inner_lines else []),
         f"outside: the normal at {_vector_text(place)}, over the radius, "
         f"is {_vector_text(unit_normal)}",
     ]

@@ -11,21 +11,25 @@ imperfection grows if a load step multiplies it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0_PLANE, Mirror, Sector, rotation
+from magshell_fenicsx.mesh.msh import MeshFile, read_msh
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
+from magshell_fenicsx.parts.forces.dead_load_step import DeadLoadSection, DeadSection
 from magshell_fenicsx.parts.imperfections.imperfection import imperfection_geometries
 from magshell_fenicsx.parts.imperfections.symmetry import imperfection_constraints
 from magshell_fenicsx.parts.laminate import ShellLaminate
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
-from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
 from magshell_fenicsx.shape.symmetry_constraint import (
     SymmetryConstraint,
     common_mirror,
@@ -33,6 +37,7 @@ from magshell_fenicsx.shape.symmetry_constraint import (
     energy_without_mirror,
     points_constraint,
     shape_constraint,
+    tilted,
     unit,
     why_not_axisymmetric,
 )
@@ -134,7 +139,57 @@ def symmetry_constraints(
         constraints += contributor.symmetry_constraints(view, outline)
     constraints.append(points_constraint(case.points.values(), case.shell.reference, outline))
     constraints += [term.symmetry_constraint(outline) for term in energies]
-    return constraints
+    return [*constraints, *_inner_line_constraints(case, outline)]
+
+
+def _dead_loads(case: Case) -> list[DeadLoadSection]:
+    """Return the dead loads of all steps of a case."""
+    steps = [step.load for step in case.context.steps if isinstance(step.load, DeadSection)]
+    return [load for step in steps for load in step.loads]
+
+
+def _inner_line_constraints(case: Case, outline: Outline) -> list[SymmetryConstraint]:
+    """Return the symmetry that lines within the surface preserve which are held or loaded.
+
+    A meridian has no such lines. A plane mirrors joined edges, but it may map a curve of a mesh
+    file onto no other, or contain it.
+    """
+    names = {*case.boundary.conditions(), *(load.edge for load in _dead_loads(case) if load.edge)}
+    joined_edges = set[str]()
+    if case.several:
+        shells = {member.name for member in case.several.parts}
+        # the edge of a T-junction, on a shell, stays an edge
+        pairs_of_edges = [edges for edges in case.several.joints if edges[1] not in shells]
+        joined_edges = {name for edges in pairs_of_edges for name in edges}
+    curves = cache(lambda: _curves_of_mesh_files(case, outline))  # reads files, once
+
+    def names_no_curve(plane: Mirror) -> bool:
+        """Return whether no curve within a mesh file is held or loaded, whatever the plane."""
+        return names.isdisjoint(curves())
+
+    reason = None
+    if joined := sorted(names & joined_edges):
+        reason = f"{joined[0]}: is a joined edge that is held or loaded, which needs a surface"
+    may_have_lines = case.several is not None or isinstance(case.shell, MeshSurface)
+    return [SymmetryConstraint(reason, mirrors=names_no_curve)] if may_have_lines else []
+
+
+def _curves_of_mesh_files(case: Case, outline: Outline) -> set[str]:
+    """Return the names of the curves within mesh files; empty if a file cannot be read."""
+    if case.several:
+        members = [m for m in case.several.parts if isinstance(m.case.shell, MeshSurface)]
+        return {
+            f"{member.name}_{name}"
+            for member in members
+            for name in _curves_of_mesh_files(
+                member.case, reference_shell_of(member.case.shell).perfect
+            )
+        }
+    shape = outline.chart(None, ANY_GRADING)
+    try:
+        return set(read_msh(shape, {}).inner_lines) if isinstance(shape, MeshFile) else set()
+    except MeshError:  # it is reported when the mesh is built
+        return set()
 
 
 def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
@@ -266,7 +321,14 @@ def _sector(
     if sector := common_sector(constraints, outline, waves, places):
         return sector
     hint = ""
-    if case.several:
+    names = {*case.boundary.conditions(), *(load.at for load in _dead_loads(case) if load.at)}
+    if any(tilted(np.array(case.points[name])) for name in names & set(case.points)):
+        hint = (
+            "; a force or a held point off e3 has no images there: model a part of the shell "
+            "alone, azimuth: [0, 90] with boundary: {left: symmetry, right: symmetry}, with half "
+            "of a force that is on one of these edges"
+        )
+    elif case.several:
         hint = "; each shell is held, and its own image in both"
     elif isinstance(case.shell, MeshSurface):
         hint = "; the mesh file must be its own image in both, with each of its edges and patches"

@@ -12,7 +12,7 @@ imperfect from the perfect surface along the normal. A user's field is a functio
 program. Reference points are those of the reference triangle. Lengths are over R.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -88,6 +88,8 @@ class Midsurface:
         Affine triangles (topological dimension 2 in space), with one layer of ghosts.
     edges
         Name -> facets (local numbers) of that boundary edge.
+    inner_lines
+        Name -> facets of that line within the surface, those of other ranks beside it included.
     points
         Name -> (3,) position of a vertex.
     _patch
@@ -96,6 +98,7 @@ class Midsurface:
 
     mesh: mesh.Mesh
     edges: dict[str, NDArray[np.int32]]
+    inner_lines: dict[str, NDArray[np.int32]]
     points: dict[str, NDArray[np.float64]]
     _patch: PatchMesh
 
@@ -302,7 +305,14 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
         comm, basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)), corners, xyz
     )
     position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
-    return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)
+    domain.topology.create_connectivity(1, 2)
+    domain.topology.create_connectivity(1, 0)
+    border = mesh.exterior_facet_indices(domain.topology)
+    edges = _named_facets(domain, border, patch.edges, vertices)
+    facet_map = domain.topology.index_map(1)
+    facets = np.arange(facet_map.size_local + facet_map.num_ghosts, dtype=np.int32)
+    inner_lines = _named_facets(domain, facets, patch.inner_lines, vertices)
+    return Midsurface(domain, edges, inner_lines, position, patch)
 
 
 def create_mesh(
@@ -349,27 +359,33 @@ def at_reference_points(
 
 
 def _named_facets(
-    domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]
+    domain: mesh.Mesh,
+    facets: NDArray[np.int32],
+    lines: Mapping[str, NDArray[np.int64]],
+    vertices: NDArray[np.int64],
 ) -> dict[str, NDArray[np.int32]]:
-    """Return the local facets of each named edge, found by the vertex numbers of the triangulation.
+    """Return the local facets of each named line, found by the vertex numbers of the triangulation.
 
     Parameters
     ----------
+    facets
+        Local facets among which they are.
+    lines
+        Name -> pairs of vertices.
     vertices
         Node of the triangulation for each vertex of the mesh, in the order of its making.
     """
-    domain.topology.create_connectivity(1, 2)
-    domain.topology.create_connectivity(1, 0)
-    facets = mesh.exterior_facet_indices(domain.topology)
+    if not lines:
+        return {}
     # a rank may have no part of any edge, and dolfinx divides by their number
     ends = np.empty((0, 2), dtype=np.int32)
     if len(facets):
         ends = mesh.entities_to_geometry(domain, 1, facets)
     # numbers of the triangulation for both ends of each facet
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
-    facets_of_edges = {}
-    for name, pairs in patch.edges.items():
-        pairs_of_edge = as_set(pairs)
-        is_on_edge = [(a, b) in pairs_of_edge for a, b in numbers]
-        facets_of_edges[name] = facets[np.array(is_on_edge, dtype=bool)]
-    return facets_of_edges
+    facets_of_lines = {}
+    for name, pairs in lines.items():
+        pairs_of_line = as_set(pairs)
+        is_on_line = [(a, b) in pairs_of_line for a, b in numbers]
+        facets_of_lines[name] = facets[np.array(is_on_line, dtype=bool)]
+    return facets_of_lines

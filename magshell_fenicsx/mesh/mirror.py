@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.patch import (
     MeshError,
     PatchMesh,
+    among,
     as_set,
     border_pairs,
     directed_sides,
-    on_border,
+    inner_pairs,
 )
 
 Array = NDArray[np.float64]
@@ -333,9 +334,11 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
     # sides of one triangle alone, in old numbers and then in the new numbers of vertices
     sides = used[directed_sides(cells)]
-    border = border_pairs(first_node[representative[sides]])
+    new_sides = first_node[representative[sides]]
+    border = border_pairs(new_sides)
     # of each edge the sides in this half stay
-    edges = on_border(edges, border)
+    edges = among(edges, as_set(border))
+    inner_lines = {n: first_node[representative[pairs]] for n, pairs in patch.inner_lines.items()}
     # border sides without a name are in the plane
     named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}
     if pairs_in_plane := sorted(as_set(border) - named_pairs):
@@ -346,6 +349,7 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
         nodes=patch.nodes[used],
         cells=cells,
         edges=edges,
+        inner_lines=among(inner_lines, inner_pairs(new_sides)),
         representative=None if glued is None else first_node[representative[used]],
         patches={name: mask[in_half] for name, mask in patch.patches.items()},
         source_triangles=None if source_triangles is None else source_triangles[in_half],

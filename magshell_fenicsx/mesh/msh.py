@@ -29,10 +29,11 @@ from magshell_fenicsx.mesh.patch import (
     MeshError,
     PatchMesh,
     SurfaceTriangles,
+    among,
     as_set,
     border_pairs,
     directed_sides,
-    on_border,
+    inner_pairs,
     place_text,
 )
 from magshell_fenicsx.mesh.vertex_spacing import distinguishable_texts
@@ -53,6 +54,7 @@ SAME_PLACE_TOLERANCE = 1e-9  # over the extent: nodes at one place
 AREA_TIE_TOLERANCE = 1e-6  # over the area: a difference of areas that decides nothing
 POINT_TOLERANCE = 1e-6  # over the extent: distance up to which a vertex counts as a named point
 HEIGHT_DIGITS = 9  # decimals of coordinates over R by which the highest vertex is found
+REST = "rest"  # name of the border sides that are in no physical curve
 TRIANGLE_TYPES = ("Triangle 3", "Triangle 6", "Triangle 10")  # gmsh's names
 LINE_TYPES = ("Line 2", "Line 3", "Line 4")
 
@@ -211,6 +213,8 @@ def _refuse_torn(
 def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dict[str, Cells]:
     """Return the part of each named curve that is a border of the surface.
 
+    Border sides in no curve are the edge `REST`.
+
     Parameters
     ----------
     curves
@@ -219,43 +223,44 @@ def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dic
     Raises
     ------
     MeshError
-        If a border edge has no name (a hole, or a node that stands twice in the file), or if the
-        surface touches itself in a vertex.
+        If triangles beside a border side without a name are not connected (a node stands twice in
+        the file), or if the surface touches itself in a vertex.
     """
     border = border_pairs(directed_sides(cells))
-    named_pairs = {pair for lines in curves.values() for pair in as_set(lines)}
-    unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in named_pairs]
+    edges = among(curves, as_set(border))
+    named_pairs = {pair for lines in edges.values() for pair in as_set(lines)}
+    unnamed = sorted(as_set(border) - named_pairs)
     if unnamed:
-        raise _error_of_unnamed(nodes, cells, unnamed[0])
+        _refuse_doubled_nodes(nodes, cells, np.unique(unnamed))
+        if REST in curves:
+            middle = nodes[list(unnamed[0])].mean(axis=0)
+            raise MeshError(
+                f"the surface ends at the edge around {place_text(middle)}, which belongs to no "
+                f"physical curve, and there is one called {REST}: give it another name"
+            )
+        edges[REST] = np.array(unnamed, dtype=np.int64)
     ends, counts = np.unique(border, return_counts=True)
     if (counts > 2).any():  # a vertex has two border edges
         raise MeshError(
             f"the surface touches itself in the vertex {place_text(nodes[ends[counts > 2][0]])}"
         )
-    return on_border(curves, border)
+    return edges
 
 
-def _error_of_unnamed(nodes: Array, cells: Cells, side: tuple[int, int]) -> MeshError:
-    """Return the error for a border side without a name, given by its two vertices.
+def _refuse_doubled_nodes(nodes: Array, cells: Cells, ends: NDArray[np.int64]) -> None:
+    """Refuse a second node at the place of an end of an unnamed side: triangles are not connected.
 
-    If there is a second node at its first vertex, triangles are not connected; if not, there is a
-    hole.
+    `ends` are the nodes at these ends.
     """
     vertices = np.unique(cells[:, :3])
-    extent = np.ptp(nodes[vertices], axis=0).max()
-    corner = nodes[side[0]]
-    distances = np.linalg.norm(nodes[vertices] - corner, axis=1)
-    if np.sum(distances < SAME_PLACE_TOLERANCE * extent) > 1:
-        return MeshError(
-            f"there are two nodes at {place_text(corner)}: "
-            "the triangles beside it are not connected"
+    extent = float(np.ptp(nodes[vertices], axis=0).max())
+    tree = scipy.spatial.cKDTree(nodes[vertices])
+    counts = tree.query_ball_point(nodes[ends], SAME_PLACE_TOLERANCE * extent, return_length=True)
+    if (counts > 1).any():
+        place = place_text(nodes[ends[int(np.argmax(counts > 1))]])
+        raise MeshError(
+            f"there are two nodes at {place}: the triangles beside it are not connected"
         )
-    middle = nodes[list(side)].mean(axis=0)
-    return MeshError(
-        f"the surface ends at the edge around {place_text(middle)}, "
-        "which belongs to no physical curve: close the hole, or name the edge "
-        "(an edge without a condition is free)"
-    )
 
 
 @dataclass(frozen=True)
@@ -318,7 +323,8 @@ def read_msh(
 ) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
-    Physical groups of surfaces become named patches, those of curves named edges. Triangles whose
+    Physical groups of surfaces become named patches, those of curves named edges, or lines within
+    the surface where they have triangles on both sides. Triangles whose
     orientation differs from that of the larger area are reversed.
 
     Parameters
@@ -425,7 +431,9 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
     cells = oriented(nodes, cells, first_copy if t_junctions else None)
     # reversing exchanges the second and the third vertex
     is_reversed = (cells[:, 1] != cells_of_file[:, 1]).astype(np.int64)
-    edges = border_edges(nodes, cells, edges)
+    curves, edges = edges, border_edges(nodes, cells, edges)
+    within = {name: pairs for name, pairs in curves.items() if name not in edges}
+    inner_lines = among(within, inner_pairs(directed_sides(cells)))
     nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
@@ -437,6 +445,7 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
         patches=triangles.patches,
         source_triangles=np.column_stack([np.arange(len(cells)), is_reversed]),
         t_junctions={name: t_junction.supports for name, t_junction in t_junctions.items()},
+        inner_lines=inner_lines,
     )
 
 
@@ -458,7 +467,11 @@ def _without_unused_nodes(
     for name, pairs in edges.items():
         edges[name] = new_number[pairs]
         if (edges[name] < 0).any():
-            raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
+            raise MeshError(
+                f"{file.path}: the physical curve {name}: beside it there are no triangles: put "
+                "the surface there in a physical group too (gmsh saves nothing else where there "
+                "are groups), or save all elements"
+            )
     return nodes[used], numbers.reshape(cells.shape), edges
 
 
@@ -564,8 +577,13 @@ def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
     if not len(content.tags):
         raise MeshError(f"{file.path}: there is no mesh in it")
     blocks = _blocks_of_dimension(file, content, 2, TRIANGLE_TYPES)
+    if not blocks:
+        raise MeshError(
+            f"{file.path}: it has no triangles: put the surface in a physical group (gmsh saves "
+            "nothing else where there are groups), and mesh it (gmsh -2)"
+        )
     if len({nodes.shape[1] for _, nodes in blocks}) != 1:
-        raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
+        raise MeshError(f"{file.path}: it has triangles of several orders")
     cells = _node_indices(file, content, np.concatenate([nodes for _, nodes in blocks]))
     # a patch is a physical group of surfaces: a triangle is in it if its surface is
     entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in blocks])

@@ -242,6 +242,7 @@ def union_of_shells(
     nodes = list[Array]()
     cells, representatives = list[NDArray[np.int64]](), list[NDArray[np.int64]]()
     edges = dict[str, NDArray[np.int64]]()
+    inner_lines = dict[str, NDArray[np.int64]]()
     points = dict[str, Array]()
     patches = dict[str, NDArray[np.bool_]]()
     cell_count = sum(len(member.patch.cells) for member in members)
@@ -254,6 +255,8 @@ def union_of_shells(
         glued = np.arange(node_count) if patch.representative is None else patch.representative
         representatives.append(glued + first_node)
         _add_edges(edges, member.name, patch, first_node, one_symmetry_edge=one_symmetry_edge)
+        for name, pairs in patch.inner_lines.items():
+            inner_lines[f"{member.name}_{name}"] = pairs + first_node
         for name in patch.points:
             # a shell's pole is a point of all shells even if the case does not name it
             if name in ("pole", *member.points):
@@ -280,6 +283,7 @@ def union_of_shells(
         patches,
         source_triangles,
         shells=tuple(member.name for member in members),
+        inner_lines=inner_lines,
     )
 
 
@@ -329,7 +333,7 @@ def _with_shell_number(coordinates: Array, number: int, embedding: MultiShellEmb
 def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
     """Return the triangulation with edges glued at joints.
 
-    Glued edges are no boundary edges any more; the edge of a T-junction stays one.
+    Glued edges are lines within the surface; the edge of a T-junction stays one.
 
     Parameters
     ----------
@@ -358,7 +362,10 @@ def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMes
             masks.append((_cells_on_edge(patch, edges[0]), _cells_on_edge(patch, edges[1])))
             glued_names |= set(edges)
     border = {name: pairs for name, pairs in patch.edges.items() if name not in glued_names}
-    return replace(patch, edges=border, joints=tuple(masks))
+    joined = {name: patch.edges[name] for name in patch.edges if name in glued_names}
+    return replace(
+        patch, edges=border, joints=tuple(masks), inner_lines={**patch.inner_lines, **joined}
+    )
 
 
 def is_t_junction(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
@@ -720,4 +727,5 @@ def _with_nodes_per_cell(patch: PatchMesh, count: int) -> PatchMesh:
         representative,
         patch.patches,
         patch.source_triangles,
+        inner_lines=patch.inner_lines,
     )

@@ -188,6 +188,9 @@ class PatchMesh:
         sheet -> (m,) whether each triangle is one that it ends on.
     shells
         Names of the patches that are shells, where there are several.
+    inner_lines
+        Name -> (e, 2) vertex pairs of a line within the surface: a joined edge, or a curve of a
+        mesh file between triangles.
     """
 
     nodes: NDArray[np.float64]
@@ -201,6 +204,7 @@ class PatchMesh:
     joints: tuple[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None, ...] = ()
     t_junctions: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     shells: tuple[str, ...] = ()
+    inner_lines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
     @property
     def corners(self) -> NDArray[np.int64]:
@@ -247,6 +251,11 @@ def directed_sides(cells: NDArray[np.int64]) -> Pairs:
     return np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
 
 
+def inner_pairs(sides: Pairs) -> set[tuple[int, int]]:
+    """Return the sides that belong to several triangles, lower vertex first."""
+    return as_set(sides) - as_set(border_pairs(sides))
+
+
 def border_pairs(sides: Pairs) -> Pairs:
     """Return the sides that belong to one triangle only, lower vertex first."""
     pairs, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
@@ -258,15 +267,17 @@ def as_set(pairs: Pairs) -> set[tuple[int, int]]:
     return {(int(a), int(b)) for a, b in np.sort(pairs, axis=1)}
 
 
-def on_border(edges: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
-    """Return the part of each named edge on the border; names without one are left out."""
-    border_set = as_set(border)
-    edges_on_border = dict[str, Pairs]()
-    for name, pairs in edges.items():
-        is_on_border = [(a, b) in border_set for a, b in np.sort(pairs, axis=1)]
-        if any(is_on_border):
-            edges_on_border[name] = pairs[is_on_border]
-    return edges_on_border
+def among(lines: Mapping[str, Pairs], sides: set[tuple[int, int]]) -> dict[str, Pairs]:
+    """Return the part of each named line among some sides; names without one are left out.
+
+    `sides` are pairs of vertices, lower one first.
+    """
+    parts = dict[str, Pairs]()
+    for name, pairs in lines.items():
+        is_there = [(int(a), int(b)) in sides for a, b in np.sort(pairs, axis=1)]
+        if any(is_there):
+            parts[name] = pairs[is_there]
+    return parts
 
 
 def check_orientation(patch: PatchMesh) -> None:

@@ -261,6 +261,7 @@ def unfold(
         cells=numbers[cells],
         embedding=unfolding.embedding(patch.embedding),
         edges=edges,
+        inner_lines={},
         # named points are those of copy 0, the sector
         points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
         representative=new_number[representative[used]] if is_glued else None,

@@ -225,7 +225,10 @@ class CapSurface(RoundSection):
         if self.hole is not None and self.hole >= self.polar - 0.1:
             raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
         if self.hole is None and self.azimuth is not None:
-            raise ValueError("azimuth: a part of a cap needs a hole around the pole")
+            raise ValueError(
+                "azimuth: a part of a cap needs a hole around the pole, such as hole: 1 (degree); "
+                "or a mesh file of the part, with boundary: symmetry at its edges in mirror planes"
+            )
         return self
 
     @property

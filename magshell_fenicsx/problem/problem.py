@@ -425,6 +425,8 @@ class Problem:
             problem names.
         """
         patch = self._triangulation()
+        if self.body:  # whose lines within the surface cannot be held or loaded
+            patch = replace(patch, inner_lines={})
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         if not self.body:
             key = "shell.file" if self._file_of_shell else "mesh"

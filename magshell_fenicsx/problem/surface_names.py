@@ -117,7 +117,8 @@ def refuse_unfit(
     MeshError
         With the missing name.
     """
-    refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
+    names = patch.edges, patch.points, patch.patches
+    refuse_unknown(*names, conditions, loads, patch.inner_lines)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
     for registered in OBSERVABLES:
         registered.refuse_unfit(loads, patch)

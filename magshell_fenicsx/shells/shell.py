@@ -208,7 +208,8 @@ class ShellModel(ThinModel):
     ) -> None:
         """Make placement, loads on the mesh and factory, then terms and system, in this order."""
         self._arguments = material, degree, conditions, loads, sigma, thickness
-        refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
+        names = midsurface.edges, midsurface.points, midsurface.patches
+        refuse_unknown(*names, conditions, loads, midsurface.inner_lines)
         loads = _magnetisation_by_cell(loads, midsurface)
         self.midsurface, self.material, self.degree = midsurface, material, degree
         self.mirror, self._conditions = mirror, conditions

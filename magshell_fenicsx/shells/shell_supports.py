@@ -182,7 +182,7 @@ class ShellSupports:
         return Support.from_conditions(constraints, edge, turn, kind=kind)
 
     def _constraints_of(self, name: str, components: tuple[int, ...]) -> list[fem.DirichletBC]:
-        """Return the constraints of displacement components on an edge, on a patch or at a point.
+        """Return the constraints of displacement components on a line, on a patch or at a point.
 
         `components` are numbers 0 to 2 of the axes.
         """
@@ -192,5 +192,7 @@ class ShellSupports:
         if name in midsurface.patches:
             cells = np.flatnonzero(midsurface.patches[name]).astype(np.int32)
             return held_on(self._V, 2, cells, components)
+        if name in midsurface.inner_lines:
+            return held_on(self._V, 1, midsurface.inner_lines[name], components)
         cells_at_point = midsurface.cells_of_point(name)
         return held_at_vertex(self._V, midsurface.points[name], components, cells_at_point)

@@ -18,7 +18,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, check_orientation
 from magshell_fenicsx.models.shell.spatial_fields import ByPatch
 from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
@@ -250,15 +250,6 @@ MOEBIUS = [
 ]
 WRONG = [
     (
-        TWO,
-        CORNERS,
-        FRAME[:3],
-        (
-            r"shell.file: the surface ends at the edge around \(0, 0.5, 0\), "
-            r"which belongs to no physical curve"
-        ),
-    ),
-    (
         [[0, 1, 2], [4, 5, 3]],
         [*CORNERS[:4], [0, 0, 0], [1, 1, 0]],
         FRAME,
@@ -292,6 +283,24 @@ def test_unsound_meshes_are_refused(
     written(cells, nodes, lines, tmp_path / "wrong.msh")
     with pytest.raises(MeshError, match=said):
         read_msh(MeshFile(tmp_path / "wrong.msh", 0.02), {})  # places are those of the file
+
+
+def test_border_sides_without_a_curve_are_the_rest(model: Any, tmp_path: Path) -> None:
+    """And a curve between triangles is a line within the surface."""
+    written(TWO, CORNERS, FRAME[:3], tmp_path / "three.msh")
+    patch = read_msh(MeshFile(tmp_path / "three.msh", 1.0), {})
+    assert {name: as_set(pairs) for name, pairs in patch.edges.items()} == {
+        "rim": {(0, 1), (1, 2), (2, 3)}, "rest": {(0, 3)},
+    }  # fmt: skip
+    model.add("within")
+    written(TWO, CORNERS, [[0, 2]], tmp_path / "within.msh")
+    patch = read_msh(MeshFile(tmp_path / "within.msh", 1.0), {})
+    assert as_set(patch.inner_lines["rim"]) == {(0, 2)}
+    assert list(patch.edges) == ["rest"]
+    content = (tmp_path / "three.msh").read_text().replace('"rim"', '"rest"')
+    (tmp_path / "named.msh").write_text(content)
+    with pytest.raises(MeshError, match="there is one called rest: give it another name"):
+        read_msh(MeshFile(tmp_path / "named.msh", 1.0), {})
 
 
 def test_triangles_the_other_way_round_are_turned(model: Any, tmp_path: Path) -> None:

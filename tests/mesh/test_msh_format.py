@@ -206,7 +206,7 @@ DAMAGED = [
         MESH.replace("4.1 0 8", "1 0 8"),
         "is damaged, or of a version that gmsh does not read, which says: Error loading",
     ),
-    (MESH.replace("$EndNodes", ""), "it has no triangles, or triangles of several orders"),
+    (MESH.replace("$EndNodes", ""), "it has no triangles: put the surface in a physical group"),
     (
         MESH.replace("$Elements\n", "$Elements\n9"),
         "is damaged, or .* which says: Could not read elements",

@@ -152,10 +152,10 @@ def test_messages() -> None:
         "loading": {"kind": "pressure"},
     }
     with pytest.raises(
-        MeshError,
-        match=r"boundary.a_rim: is joined, by joints.0, and no edge of the surface; its edges",
+        CaseError,
+        match=r"symmetry: axisymmetric: a_rim: is a joined edge that is held or loaded",
     ):
-        Case.from_source(lens).problem()
+        Case.from_source({**lens, "symmetry": "axisymmetric"}).problem()
     with pytest.raises(
         MeshError,
         match=r"joints.0.edges: left.right and right.left do not meet, by 0.1 R at \(1.1, ",
@@ -201,13 +201,14 @@ LINE = {
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("loading.loads.0.edge=beam.right", "beam.right: is joined, by joints.0, and no edge of"),
+        ("loading.loads=[{edge: beam.right, moment: 1}]",
+         "loading.loads: edge: beam.right: is a line within the surface"),
         ("loading.loads.0.edge=beam.nowhere",
          "loading.loads: edge: beam.nowhere: the surface has only arm."),
         ("loading.loads=[{at: arm.tap, force: [0, 0, 1]}]",
          "arm.tap: name it in points, with its place; there are"),
         ("shells.beam.boundary.right=clamped",
-         "shells.beam.boundary.right: is joined, by joints.0, and no edge"),
+         "shells.beam.boundary.right: is a line within the surface"),
     ],
 )  # fmt: skip
 def test_names_in_messages_are_those_of_the_case(

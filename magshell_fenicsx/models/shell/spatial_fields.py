@@ -459,7 +459,7 @@ def pattern_on_edge(
 
     field.rebuild = rebuild
     Q = field.function_space
-    cells, local_sides = _cells_at_facets(V.mesh.topology, facets)
+    cells, local_sides = cells_at_facets(V.mesh.topology, facets)
     edges = _facets_as_cells(r0, facets, cells, local_sides)
     element = Q.element.basix_element
     edge_element = _interval_element(element.degree)  # the field's element along a facet
@@ -506,10 +506,10 @@ def _facets_as_cells(
     return CellGeometry(edge_element, nodal, owned, V.mesh.comm)
 
 
-def _cells_at_facets(
+def cells_at_facets(
     topology: mesh.Topology, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Return the one cell (facets,) at each boundary facet, and the facet's local number in it.
+    """Return the first cell (facets,) at each facet, and the facet's local number in it.
 
     `facets` are their local numbers on this rank.
     """

@@ -100,7 +100,7 @@ class DeadLoadSection(Section):
     at: str | None = None
     """A point of `points`"""
     edge: str | None = None
-    """An edge of the geometry"""
+    """An edge of the geometry; or a line within it, a joined edge or a curve of a mesh file"""
     over: str | None = None
     """all, or a patch of a mesh"""
     force: Force | None = None

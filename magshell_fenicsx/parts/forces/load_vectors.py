@@ -13,7 +13,7 @@ around a point over which its force is spread.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import basix
 import numpy as np
@@ -41,6 +41,7 @@ from magshell_fenicsx.models.shell.parameters import (
 from magshell_fenicsx.models.shell.spatial_fields import (
     ADDED_LOAD_DEGREE,
     Pattern,
+    cells_at_facets,
     pattern_field,
     pattern_on_edge,
 )
@@ -605,6 +606,24 @@ def patch_indicator(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function
     return indicator
 
 
+def sides_of_cells(domain: mesh.Mesh, facets: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the sides over which a line within a surface is integrated, each facet on one rank.
+
+    Parameters
+    ----------
+    facets
+        Local numbers of its facets.
+
+    Returns
+    -------
+    numpy.ndarray
+        (2 n,): for each of this rank's own facets a cell beside it, and the number of the facet
+        there.
+    """
+    own_facets = facets[facets < domain.topology.index_map(1).size_local]
+    return np.column_stack(cells_at_facets(domain.topology, own_facets)).astype(np.int32).ravel()
+
+
 class SurfaceMeasures:
     """The `Measures` of a mid-surface.
 
@@ -629,8 +648,12 @@ class SurfaceMeasures:
 
     def edge(self, name: str) -> Weighted:
         """Return the measure of undeformed length on a named edge."""
-        domain, facets = self._midsurface.mesh, self._midsurface.edges[name]
-        tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
+        domain, lines = self._midsurface.mesh, self._midsurface.inner_lines
+        if name in lines:  # seen from one of the two cells beside each facet
+            tags: Any = [(1, sides_of_cells(domain, lines[name]))]
+        else:
+            facets = self._midsurface.edges[name]
+            tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
         # two degrees more, as lengths and formulas along the edge are no polynomials
         rule = {"quadrature_degree": edge_quadrature(self._degree) + 2}
         ds = ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=rule)(1)  # the tag 1
@@ -654,7 +677,9 @@ class SurfaceMeasures:
         """
         if edge is None:
             return pattern_field(pattern, self._r0, ADDED_LOAD_DEGREE)
-        return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], ADDED_LOAD_DEGREE)
+        surface = self._midsurface
+        facets = {**surface.edges, **surface.inner_lines}[edge]
+        return pattern_on_edge(pattern, self._r0, facets, ADDED_LOAD_DEGREE)
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         surface = self._midsurface

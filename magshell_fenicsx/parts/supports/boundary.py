@@ -76,7 +76,8 @@ class BoundarySection(Section, Ability):
     clamped: neither displacement nor rotation. hinged, or simply supported: no displacement.
     symmetry: the edge lies in a mirror plane of a shape of which this is a part (of a whole shape
     take `symmetry: half`). held: some components of the displacement; a point of `points` can be
-    held too. A patch of a mesh file can be clamped or held, all of it, if no edge has its name.
+    held too. A patch of a mesh file can be clamped or held, all of it, if no edge has its name. A
+    line within the surface, a joined edge or a curve of a mesh file, can be hinged or held.
     """
 
     model_config = Section.model_config | {"extra": "allow"}

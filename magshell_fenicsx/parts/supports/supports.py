@@ -24,7 +24,7 @@ from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, sy
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, BodyMesh
 from magshell_fenicsx.mesh.mirror import PLANARITY_TOLERANCE, Mirror
 from magshell_fenicsx.mesh.patch import MeshError, place_text
-from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeForce, HeldComponents
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.supports.support_motion import Support
 
@@ -110,48 +110,45 @@ def refuse_unknown(
     patches: Collection[str],
     conditions: Mapping[str, Condition],
     loads: Loads,
+    inner_lines: Collection[str] = (),
 ) -> None:
     """Refuse supports and loads on edges, points and patches that do not exist.
 
     Parameters
     ----------
-    edges, points, patches
+    edges, points, patches, inner_lines
         Names that the surface has.
     conditions
-        Name of an edge, a point or a patch -> its support.
+        Name of an edge, a point, a patch or a line within the surface -> its support.
 
     Raises
     ------
     MeshError
         With the missing name and those that there are.
     """
-    # edge that a joint has removed -> number of the joint
-    joint_of_edge = {
-        edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges
-    }
 
-    def refuse_joined(key: str, name: str) -> None:
-        """Refuse the name of an edge that a joint has removed from the surface's edges."""
-        if name in joint_of_edge and name not in patches:
-            edge_names, number = ", ".join(sorted(edges)) or "none", joint_of_edge[name]
+    def refuse_inner_line(key: str, name: str) -> None:
+        """Refuse what a line within the surface cannot have."""
+        if name in inner_lines:
             raise MeshError(
-                f"{key}: is joined, by joints.{number}, and no edge of the surface; its edges: "
-                f"{edge_names}"
+                f"{key}: is a line within the surface, a joined edge or a curve of the mesh: it "
+                "can be hinged or held, and loaded by force or per_length"
             )
 
     # supports
     for name, condition in conditions.items():
-        allowed = _names_that_can_have(condition, edges, points, patches)
+        allowed = _names_that_can_have(condition, edges, points, patches, inner_lines)
         if name not in allowed:
-            refuse_joined(f"boundary.{name}", name)
+            refuse_inner_line(f"boundary.{name}", name)
             allowed_names = ", ".join(sorted(allowed)) or "none"
             raise MeshError(f"boundary.{name}: the surface has no such edge, only {allowed_names}")
     # dead loads on edges
     for load in loads.all_dead:
+        lines = {*edges, *inner_lines} if isinstance(load, EdgeForce) else edges
         edge = getattr(load, "edge", None)
-        if edge is not None and edge not in edges:
-            refuse_joined(f"loading.loads: edge: {edge}", edge)
-            allowed_names = ", ".join(sorted(edges)) or "none"
+        if edge is not None and edge not in lines:
+            refuse_inner_line(f"loading.loads: edge: {edge}", edge)
+            allowed_names = ", ".join(sorted(lines)) or "none"
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
     # terms of a program on edges
     for term in loads.user_terms:
@@ -166,11 +163,13 @@ def _names_that_can_have(
     edges: Collection[str],
     points: Collection[str],
     patches: Collection[str],
+    inner_lines: Collection[str],
 ) -> set[str]:
-    """Return the names of the edges, points and patches that a support can have.
+    """Return the names of edges, points, patches and lines within that can have a support.
 
     An edge can have any support. A point can have held components, but for the pole, which is a
-    name of the program's own. A patch can have held components, or be clamped.
+    name of the program's own. A patch can have held components, or be clamped. A line within the
+    surface can have held components, or all of them.
     """
     names = set(edges)
     holds_components = isinstance(condition, HeldComponents)
@@ -178,6 +177,8 @@ def _names_that_can_have(
         names |= set(points) - {"pole"}
     if holds_components or condition == "clamped":
         names |= set(patches)
+    if holds_components or condition in ("simply supported", "free"):
+        names |= set(inner_lines)
     return names
 
 
