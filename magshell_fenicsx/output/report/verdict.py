@@ -150,6 +150,7 @@ COLUMN_ORDER = (
     "place",
     "reaction",
     "moment",
+    "stress",
     "count",
 )
 # kind -> unit, of a path.csv without columns in units
