@@ -54,7 +54,7 @@ GROUPS = {  # question -> its cases
     "How far does it bend?": (
         "gripper gripper_closed magnetic_strip magnet_strip saturated_strip own_field "
         "magnetic_balloon balloon natural_strip standing_strip shortened_strip programme bracket "
-        "stiffened_plate clamped_plate foundation"
+        "stiffened_plate clamped_plate foundation tank"
     ),
     "What does a sensor read, how does it ring?": "hall_sensor free_plate spinning_blade",
     "How do I shape or magnetise it, what is my sample?": (

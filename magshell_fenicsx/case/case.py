@@ -154,6 +154,10 @@ class Case(WithParts):
     """Which numbers measured data are to determine, for `magshell identify`"""
     output: OutputSection = OutputSection.model_construct()
     """How pictures look"""
+    stress: list[str] | None = Field(default=None, max_length=1000)
+    """Names of points at which path.csv has membrane forces, moments, shear forces and stresses;
+    of a mesh file they may be anywhere. fields/ have forces and stresses too, without points for
+    []"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support
     moves"""

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 Keys = dict[str, Any]
 REPLACED_KEYS = ("shell", "boundary", "points")
 # sections that name edges, points and patches
-SECTIONS_WITH_NAMES = ("loading", "contact", "joints", "natural", "magnetic")
+SECTIONS_WITH_NAMES = ("loading", "contact", "joints", "natural", "magnetic", "stress")
 FILE_KEYS = ("file", "program")  # their values are no such names
 COMMON_KEYS = ("viscosity", "relaxation")
 KEYS_OF_FIRST = (*LawKeys.model_fields, *COMMON_KEYS)

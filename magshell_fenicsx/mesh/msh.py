@@ -320,6 +320,7 @@ def read_msh(
     points: Mapping[str, Array],
     mirror: Mirror | None = None,
     held_edges: Collection[str] = (),
+    anywhere: Collection[str] = (),
 ) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
@@ -339,6 +340,8 @@ def read_msh(
         Symmetry plane or sector, whose half or sector of the surface is returned; None for all.
     held_edges
         Names of edges that are clamped or hinged.
+    anywhere
+        Names of points that need not be vertices; those that are none are left out.
 
     Returns
     -------
@@ -362,7 +365,8 @@ def read_msh(
             f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half"
         )
     patch = cut(patch, mirror) if mirror else patch
-    return replace(patch, points=_named_vertices(patch, points, file.scale, held_edges))
+    vertices = _named_vertices(patch, points, file.scale, held_edges, anywhere=anywhere)
+    return replace(patch, points=vertices)
 
 
 def _with_points_of_shells(
@@ -495,6 +499,7 @@ def _named_vertices(
     scale: float,
     held_edges: Collection[str],
     shell_poles: Sequence[Array] = (),
+    anywhere: Collection[str] = (),
 ) -> dict[str, Array]:
     """Return the vertex (d,) of each named point, and the highest vertex as "pole".
 
@@ -511,6 +516,8 @@ def _named_vertices(
         Poles (d,) of several shells.
     scale
         Factor from the file's coordinates to lengths over R, for messages.
+    anywhere
+        Names of points that need not be vertices.
 
     Raises
     ------
@@ -526,6 +533,8 @@ def _named_vertices(
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > POINT_TOLERANCE * np.ptp(corners[:, :3], axis=0).max():
+            if name in anywhere:
+                continue
             place, nearest_place = np.asarray(x[:3] / scale), np.asarray(nearest[:3] / scale)
             text, nearest_text = distinguishable_texts(place, nearest_place)
             raise MeshError(

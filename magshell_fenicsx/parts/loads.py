@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
     from magshell_fenicsx.parts.natural.shape import Natural
     from magshell_fenicsx.parts.pressure.profile import PressureProfile
+    from magshell_fenicsx.parts.stress import StressReading
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,8 @@ class Loads:
         The pairs that may touch: the shell itself, or parts of it.
     joints
         The edges that are joined.
+    stress
+        The points at which stresses are read; None without.
     """
 
     pressure: bool = False
@@ -89,6 +92,7 @@ class Loads:
     interaction: "Interaction | None" = None
     pairs: "tuple[Pair, ...]" = ()
     joints: "tuple[Joint, ...]" = ()
+    stress: "StressReading | None" = None
 
     def __add__(self, other: "Loads") -> "Loads":
         """Return the sum of both: mappings and tuples are joined.

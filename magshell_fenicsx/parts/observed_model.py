@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.bodies.body_contact import BodyContact, Region
     from magshell_fenicsx.parts.contact.pair_contact import PairContact
     from magshell_fenicsx.parts.loads import Loads
+    from magshell_fenicsx.parts.stress import StressState
     from magshell_fenicsx.parts.supports.support_motion import Support
 
 
@@ -97,6 +98,15 @@ class ObservedModel(Protocol):
         """Return the region where a body touches the shell; collective.
 
         `approach` is the amplitude of the body's approach, the key of `contacts`.
+        """
+
+    def stresses(self, state: "State") -> "Mapping[str, StressState]":
+        """Return name -> stresses at the points at which they are read; not of a solid; collective.
+
+        Raises
+        ------
+        MeshError
+            If they have no single value at a point.
         """
 
     def deflection(self, u: "Vector", point: str) -> float:

@@ -24,6 +24,7 @@ REGISTERED: dict[str, tuple[str, ...]] = {
         "bodies.body.RigidBodies",
         "contact.contact_section.ShellContact",
         "joints.CaseJoints",
+        "stress.StressPoints",
     ),
     "steps": (  # in the order of the documentation
         "pressure.pressure.PressureSection",
@@ -60,6 +61,7 @@ REGISTERED: dict[str, tuple[str, ...]] = {
         "shell_observables.EnergyObservables",
         "shell_observables.PointObservables",
         "shell_observables.OwnEnergyObservables",
+        "stress.StressObservables",
     ),
     "bodies": (  # in the order of the documentation, as all that follow
         "bodies.plane.PlaneSection",

@@ -31,7 +31,7 @@ from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.mesh.unfolding import double_sector
 from magshell_fenicsx.mesh.vertex_spacing import refuse_flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, with_cell_at_edge
-from magshell_fenicsx.models.shell.parameters import Condition, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Material, PointForce
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.body_densities import CompressibleRubber
@@ -468,6 +468,19 @@ class Problem:
         half = triangulate(half_shape, self.size, points, self.embedding)
         return replace(double_sector(half, self.mirror.angle), points=dict(self.points))
 
+    @property
+    def _points_anywhere(self) -> set[str]:
+        """Names of the points of a mesh file that need not be vertices: stresses alone are read.
+
+        Where the first point of the case is one, so is "pole", its other name.
+        """
+        stress = self.loads.stress
+        names = {point.name for point in stress.points} if stress else set[str]()
+        names -= {*self.conditions, *(force.point for force in self.loads.forces.values())}
+        names -= {load.point for load in self.loads.all_dead if isinstance(load, PointForce)}
+        first_name = next(iter(self.context.points), None)
+        return names | ({"pole"} if first_name in names else set())
+
     def _triangulation(self) -> PatchMesh:
         """Return the triangulation of the half, the sector or the whole surface, unchecked.
 
@@ -480,7 +493,9 @@ class Problem:
                 for name, condition in self.conditions.items()
                 if condition in ("clamped", "hinged")
             ]
-            patch = read_msh(self.shape, self.points, self.mirror, held_edges)
+            patch = read_msh(
+                self.shape, self.points, self.mirror, held_edges, self._points_anywhere
+            )
             return replace(patch, embedding=self.embedding)
         if isinstance(self.shape, PatchMesh):
             return replace(self.shape, embedding=self.embedding)

@@ -24,6 +24,7 @@ Kind = Literal[
     "place",
     "reaction",
     "moment",
+    "stress",
     "count",
     "text",
 ]
@@ -64,6 +65,11 @@ class CaseSizes:
     def force(self) -> float:
         """The unit 2πD/R of forces (N), with the bending stiffness D = E h³/(12(1 - ν²))."""
         return pi * self.E * self.h**3 / (6 * (1 - self.nu**2) * self.R)
+
+    @property
+    def moment(self) -> float:
+        """The unit D/R of moments per length (N)."""
+        return self.force / (2 * pi)
 
     @property
     def in_si(self) -> float:

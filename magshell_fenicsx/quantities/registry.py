@@ -34,6 +34,7 @@ from magshell_fenicsx.quantities.quantity import (
     Quantity,
     Unit,
 )
+from magshell_fenicsx.quantities.stresses import stress_columns, stress_quantity
 
 # Modes of the model itself in the column of modes; its symmetry excludes all others.
 OWN_MODES = ("", "symmetric", "asymmetric")
@@ -273,7 +274,8 @@ register_for_all_cases(QUANTITIES.values())
 
 def units_in_use() -> tuple[Unit, ...]:
     """Return the units of all columns, each once, also of those of supports and named points."""
-    columns = (*QUANTITIES.values(), *map(quantity, ("_ux", "_fx", "_mx")))
+    endings_of_points = (f"point_{ending}" for ending in stress_columns(has_stresses=True))
+    columns = (*QUANTITIES.values(), *map(quantity, ("_ux", "_fx", "_mx", *endings_of_points)))
     return tuple(dict.fromkeys(unit for q in columns for unit in q.units))
 
 
@@ -296,8 +298,8 @@ def told_quantity(name: str) -> Quantity | None:
 
     Not registered are the columns of a second load ("force_2"), of its displacement
     ("w_force_2_over_h"), of one of several bodies, of the forces on a body ("ball_normal_force"),
-    and of the displacement, reaction or moment of a named place ("rim_ux"). The factor of a motion
-    or of a user's energy has any name.
+    of the displacement, reaction or moment of a named place ("rim_ux"), and of a force, moment or
+    stress at a point ("A_N11"). The factor of a motion or of a user's energy has any name.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
@@ -316,6 +318,8 @@ def told_quantity(name: str) -> Quantity | None:
             f"at {conjugate[1].replace('_', ' ')}",
             f"Displacement conjugate to {conjugate[1]}, as w_over_h.",
         )
+    if at_point := stress_quantity(name):
+        return at_point
     # the amplitude of a second step of a kind
     if numbered_name := re.fullmatch(r"(\w+)_(\d+)", name):
         first_of_kind = QUANTITIES.get(numbered_name[1])

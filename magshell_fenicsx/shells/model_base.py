@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
@@ -37,6 +37,7 @@ from magshell_fenicsx.parts.forces.load_vectors import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.penalty_contact import PenaltyContact
+from magshell_fenicsx.parts.stress import StressState
 from magshell_fenicsx.parts.supports.support_motion import Support
 from magshell_fenicsx.parts.supports.supports import free_motion
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
@@ -98,7 +99,8 @@ class ModelBase:
     _volume
         Form of Delta V/R^3 of the modelled part.
     _probes
-        Name of a vertex -> its three unknowns, on the rank that owns it; empty on other ranks.
+        Name of a point -> this rank's unknowns (n, 3) of the nodes that have it, and the factors
+        (n,) of their displacements; of a vertex one node with the factor 1.
     """
 
     system: FiniteElementSystem
@@ -159,14 +161,34 @@ class ModelBase:
         """
         self._volume = volume
         V = self.system.u.function_space
-        probes = {}
+        self._probes = {}
         for name, x in points.items():
             cells = cells_at_point and cells_at_point(name)
             # unknowns on which a force at the vertex acts; any direction without zeros gives all
             # three of them
-            unknowns, _ = point_entries(V, x, np.ones(3), cells)
-            probes[name] = unknowns
-        self._probes = probes
+            unknowns, factors = point_entries(V, x, np.ones(3), cells)
+            self._probes[name] = unknowns.reshape(-1, 3), factors[::3]
+
+    def observe_inside(self, name: str, cells: NDArray[np.int64], reference: Array) -> None:
+        """Observe a point inside cells, which is no vertex; collective.
+
+        Parameters
+        ----------
+        cells, reference
+            Numbers (m,) of this rank's cells that have the point, and the place (m, d) in them.
+        """
+        V = self.system.u.function_space
+        table = V.element.basix_element.tabulate(0, reference)[0, ..., 0]
+        shares = fem.Function(V)
+        # nodes of cells may belong to other ranks, which have no cell with the point: the first
+        # rank that has one gives the values of its cell to all ranks
+        rank = min(V.mesh.comm.allgather(V.mesh.comm.rank if len(cells) else V.mesh.comm.size))
+        if rank == V.mesh.comm.rank:
+            shares.x.array.reshape(-1, 3)[V.dofmap.list[cells[0]]] = table[0][:, None]
+        shares.x.scatter_reverse(la.InsertMode.add)
+        factors = shares.x.array.reshape(-1, 3)[: V.dofmap.index_map.size_local, 0]
+        nodes = np.flatnonzero(factors)
+        self._probes[name] = 3 * nodes[:, None] + np.arange(3), factors[nodes]
 
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
         """Return the term of an amplitude's dead loads, without its moments.
@@ -231,18 +253,18 @@ class ModelBase:
         return -float(self.displacement(u, point) @ self.normals[point])
 
     def displacement(self, u: Vector, point: str) -> Array:
-        """Return u/R (3,) at a named vertex; collective."""
-        rank_part = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
-        return np.asarray(self.system.comm.allreduce(rank_part))
+        """Return u/R (3,) at a named point; collective."""
+        unknowns, factors = self._probes[point]
+        return np.asarray(self.system.comm.allreduce(factors @ u[unknowns]))
 
     def probe(self, point: str) -> Array:
-        """Return the matrix (3, local size) that maps u to the displacement of a named vertex.
+        """Return the matrix (3, local size) that maps u to the displacement of a named point.
 
         Each rank has the columns of its own unknowns.
         """
         rows = np.zeros((3, self.system.size))
-        dofs = np.asarray(self._probes[point]).reshape(-1, 3)
-        rows[np.arange(3), dofs] = 1.0
+        unknowns, factors = self._probes[point]
+        rows[np.arange(3), unknowns] = factors[:, None]
         return rows
 
     def region(self, state: State, approach: str) -> Region:
@@ -390,6 +412,28 @@ class ThinModel(ModelBase):
     @property
     def law_of_cells(self) -> Law:
         return self.factory.law_of_cells
+
+    def stresses(self, state: State) -> dict[str, StressState]:
+        """Return name -> stresses at the points at which they are read; collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if they have no single value at a point.
+        """
+        from magshell_fenicsx.shells.stress_points import (  # of few runs
+            meridian_stresses,
+            shell_stresses,
+        )
+
+        at_point: Any = shell_stresses if self.midsurface else meridian_stresses
+        points = self.loads.stress.points if self.loads.stress else ()
+
+        def at_points() -> dict[str, StressState]:
+            """Return the stresses at the system's state."""
+            return {point.name: at_point(self, point, state.mu) for point in points}
+
+        return self.system.at_state(state).evaluate(at_points)
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """Return the function that integrates an expression over the undeformed area."""

@@ -95,7 +95,7 @@ class Revolution:
         # at both ends, then a little within
         values = self._derivatives(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
         at_pole = self._poles[self.ends][..., None]
-        return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
+        return revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
         """Return the jets (6, cells, q, 3) of a field at reference points (q, 1) of all cells.
@@ -103,7 +103,7 @@ class Revolution:
         `f` has components (U, W). Jets are the value and the first and second derivatives, along
         (e_rho, e_theta, e_z). No point may be on the axis.
         """
-        return _revolved(self._derivatives(f, points))
+        return revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
         """Return the values (cells, q) of a field (1,) at reference points (q, 1) of all cells."""
@@ -203,7 +203,7 @@ class Revolution:
         )
 
 
-def _revolved(values: Array) -> Array:
+def revolved(values: Array) -> Array:
     """Return jets (6, cells, q, 3) of an axisymmetric field along (e_rho, e_theta, e_z).
 
     `values` are its value and derivatives (3, cells, q, 2) along the meridian.

@@ -298,8 +298,18 @@ class ShellModel(ThinModel):
             midsurface.points,
             midsurface.cells_of_point,
         )
+        self._observe_inside_cells()
         if interaction is not None:
             interaction.refuse_near()  # reads the finished model
+
+    def _observe_inside_cells(self) -> None:
+        """Observe points of stresses that are no vertices, as those of a mesh file; collective."""
+        for point in self.loads.stress.points if self.loads.stress else ():
+            if point.name not in self.midsurface.points:
+                from magshell_fenicsx.shells.stress_points import point_of_shell
+
+                at = point_of_shell(self, point)
+                self.observe_inside(point.name, at.cells, at.reference)
 
     def _normals_at_points(self) -> dict[str, NDArray[np.float64]]:
         """Return the undeformed normals (3,) at the named points; collective."""

@@ -116,6 +116,8 @@ class Outcome:
             return True
         if self.found != "path":
             return False
+        if scalar.is_frequency and self.stopped is None:
+            return bool(self.curve) and any(scalar.column in row for row in self.curve)
         needed = {scalar.column, scalar.at} & set(COLUMNS)  # those that an outcome may leave out
         return not self.curve or needed <= self.curve[0].keys()
 

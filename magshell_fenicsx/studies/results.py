@@ -21,6 +21,7 @@ from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, is_column
 
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
+FREQUENCY = re.compile(r"(omega2|hertz)_[1-9]\d*")
 FORMS = (
     f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 )
@@ -43,6 +44,11 @@ class Scalar:
     column: str = ""
     at: str = ""
     value: float = 0.0
+
+    @property
+    def is_frequency(self) -> bool:
+        """Whether it is a natural frequency where the path ends."""
+        return bool(FREQUENCY.fullmatch(self.column))
 
     def value_in(
         self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]
@@ -72,7 +78,8 @@ class Scalar:
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         # the rows must have both columns; "end" is no column
         needed_columns = {self.column, self.at} - {"end"}
-        if not path or not needed_columns <= set(path[0]):
+        # the last row has the frequencies of the end, too
+        if not path or not needed_columns <= set(path[-1 if self.at == "end" else 0]):
             return None
         if self.at == "end":
             return float(path[-1][self.column])
@@ -104,8 +111,13 @@ class Scalar:
         return _number(errors.get(f"{self.column}@end")) if is_at_end else None
 
 
-def parse_scalar(text: str) -> Scalar:
+def parse_scalar(text: str, *, with_frequencies: bool = False) -> Scalar:
     """Read `--result`, the name of a number of a run.
+
+    Parameters
+    ----------
+    with_frequencies
+        Whether natural frequencies at the end, such as "hertz_1@end", are such numbers.
 
     Raises
     ------
@@ -123,11 +135,13 @@ def parse_scalar(text: str) -> Scalar:
         return Scalar(text)
     column, _, place = text.partition("@")
     place_column, _, number = place.partition("=")
-    if re.fullmatch(r"(omega2|hertz)_\d+", column):
+    if FREQUENCY.fullmatch(column):
+        if with_frequencies and place == "end":
+            return Scalar(text, column, "end")
         raise CaseError(
             f"--result {text}: {column} is a natural frequency, which path.csv has not: runs with "
             "frequencies: {at: end} list it in frequencies.csv; design, identify and gradients "
-            "take it as a result"
+            f"take it as a result, and sweep as {column}@end"
         )
     # both names must be columns with numbers; "end" has no second one
     for name in (column, place_column) if place != "end" else (column,):

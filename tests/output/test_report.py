@@ -238,6 +238,27 @@ def test_critical_field_and_excluded_mode(tmp_path: Path) -> None:
     assert f"The run stopped early, after 2 points: {stop}." in found.text
 
 
+def test_instabilities_of_the_last_step(tmp_path: Path) -> None:
+    """A field that snaps a dome through, then back: the second step's are told too."""
+
+    def row(label: str, lambda_m: float, step: int, mode: str = "") -> dict[str, Any]:
+        """Return a point of a path in a field."""
+        numbers = {"lambda_m": lambda_m, "step": step}
+        return {"label": label, "amplitude": "lambda_m", "mode": mode, **numbers}
+
+    back = [row("bifurcation", 0.02, 2, "m = 2"), row("fold", 0.03, 2)]
+    found = page(tmp_path, [row("fold", -0.05, 1), *back], knockdown=None)
+    assert "critical λm = −0.05: a fold" in found.text
+    told = "a bifurcation (m = 2 waves) at λm = 0.02, a fold at λm = 0.03."
+    assert f"Step 2, the last, has 2 instabilities: {told}" in found.text
+    only = page(tmp_path, back, knockdown=None)
+    assert "the last, has" not in only.text  # the first is told alone
+    many = [row("fold", -0.05, 1), *(row("fold", 0.01 * i, 2) for i in range(1, 8))]
+    text = page(tmp_path, many, knockdown=None).text
+    assert "7 instabilities: a fold at λm = 0.01, a fold at λm = 0.02" in text
+    assert "a fold at λm = 0.03, ..., a fold at λm = 0.07." in text
+
+
 def test_interrupted_at_once_without_pictures(tmp_path: Path) -> None:
     """What stopped it is shown as text, whatever is in it."""
     found = page(tmp_path, [], stopped="<b>1 & 2</b>", knockdown=None)

@@ -264,6 +264,19 @@ def test_a_named_result_of_each_point(tmp_path: Path, computed: list[float]) -> 
     assert "2 of 2 points gave no critical_field; sweep.csv says why" in none.stderr
 
 
+def test_a_frequency_at_the_end_of_each_point(tmp_path: Path) -> None:
+    """A clamped disc: omega R^2 sqrt(rho h/D) = 10.2158 (Leissa, Vibration of Plates, NASA SP-160),
+    so omega2 is in proportion to h^2."""
+    over, still = ["shell.radius_to_thickness=50:100:2"], ["loading.pressure=1e-9", *COARSE]
+    done = sweep(PLATE, over, still, tmp_path, result="omega2_1@end")
+    for ratio, found in zip((50, 100), done.results, strict=True):
+        assert found == pytest.approx(10.2158**2 / (12 * (1 - 0.3**2) * ratio**2), rel=5e-3)
+    again = sweep(PLATE, over, still, tmp_path, result="omega2_1@end")
+    assert again.results == done.results
+    with pytest.raises(CaseError, match=r"hertz_1: needs shell\.density"):
+        sweep(PLATE, over, still, tmp_path, result="hertz_1@end")
+
+
 def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[float]) -> None:
     """Each computes its share into one folder; the whole sweep then computes nothing."""
     over = "loading.pressure=1e-5:3e-5:3"

@@ -188,6 +188,15 @@ class Laminated(Law):
             self.modulus_factor * self.thickness_factor, _stress(self.A, frame.strain_components(E))
         )
 
+    def force(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        """Return A times the strain less B times the change of curvature, with indices up."""
+        frame = _Frame(self.direction, up)
+        coupled = frame.components_up(
+            self._coupling_factor, _stress(self.B, frame.strain_components(K))
+        )
+        N11, N12, N22 = (S - C for S, C in zip(self.stress(E, up), coupled, strict=True))
+        return N11, N12, N22
+
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         """Return K : D : K/2 - E : B : K, the energy of bending over E h per undeformed area.
 

@@ -135,6 +135,13 @@ class Law(ABC):
     def stress(self, E: Tensor, up: Tensor) -> Components:
         """Return the derivative of `membrane` by E."""
 
+    def force(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        """Return the membrane force: the stress and what coupled bending adds to it.
+
+        It is the derivative of `membrane` and, where the plies couple both, of `bending` by E.
+        """
+        return self.stress(E, up)
+
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
         """Return the difference of the stress at E + change and the stress at E."""
         if self.linear is self:  # the stress is linear in E
@@ -339,6 +346,12 @@ class LawByShell(Law):
             self._value_at_place, zip(*(law.stress(E, up) for law in self.laws), strict=True)
         )
         return S11, S12, S22
+
+    def force(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        N11, N12, N22 = map(
+            self._value_at_place, zip(*(law.force(E, K, up) for law in self.laws), strict=True)
+        )
+        return N11, N12, N22
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         M11, M12, M22 = map(

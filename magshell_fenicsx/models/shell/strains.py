@@ -195,6 +195,15 @@ class NaturalFrame:
         """Return U^-1 (E - E_n) U^-1, (..., 3): the strain as measured in the natural shape."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
+    def force(self, E: Array, K: Array, law: Law) -> Array:
+        """Return N (..., 3) over E h, the derivative of the energy by E.
+
+        E and K (..., 3) are strain and change of curvature in the frame, from the undeformed shape.
+        """
+        up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
+        N = law.thicker(self.thickness).force(_matrix(E - self.strain), _matrix(K - self.bend), up)
+        return np.asarray(area[..., None] * np.stack(N, axis=-1))
+
     def moment(self, E: Array, K: Array, law: Law) -> Array:
         """Return M (..., 3) over E h R, the derivative of the energy by K.
 
@@ -214,6 +223,14 @@ def _matrix(S: Array) -> Array:
 def _components(S: Array) -> Array:
     """Return the components S_11, S_12, S_22 (..., 3) of symmetric matrices (..., 2, 2)."""
     return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
+
+
+def membrane_force(E: Array, K: Array, law: Law) -> Array:
+    """Return N_11, N_12, N_22 (..., 3) over E h, in an orthonormal frame.
+
+    E and K (..., 3) are the components 11, 12, 22 of strain and change of curvature.
+    """
+    return np.stack(law.force(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 
 
 def bending_moment(E: Array, K: Array, law: Law) -> Array:

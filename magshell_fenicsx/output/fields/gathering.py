@@ -31,7 +31,7 @@ from magshell_fenicsx.models.shell.spatial_fields import inside_cells
 from magshell_fenicsx.output.fields.contact_peak import contact_peak
 from magshell_fenicsx.output.fields.point_fields import (
     PointFields,
-    Stresses,
+    mises_fields,
     principal_fields,
     rubber_fields,
 )
@@ -46,6 +46,7 @@ from magshell_fenicsx.output.fields.surface import (
     resolved_pressure,
 )
 from magshell_fenicsx.shells.revolution import ENDS, Revolution
+from magshell_fenicsx.shells.stresses import Stresses
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -169,13 +170,17 @@ class RevolvedGatherer:
             self._set_placement(state.mu)
         swept = self._swept
         # strains and moments are recovered from samples, other fields are computed at ends
-        stresses = self._stresses.values_of(swept.inner_jets(self._model.u, self._inner), state.mu)
+        u_at_samples = swept.inner_jets(self._model.u, self._inner)
+        stresses = self._stresses.values_of(u_at_samples, state.mu)
+        if self._model.loads.stress:
+            stresses |= self._stresses.forces_of(u_at_samples, state.mu)
         # by name, "E" and "M": components at the ends, and the jump of the samples
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
         values = (
             tensors
             | principal_fields(components)
+            | mises_fields(tensors)
             | self._fields.values_of(swept.jets(self._model.u), state.mu)
         )
 

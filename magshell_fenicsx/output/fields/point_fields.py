@@ -30,15 +30,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.spatial_fields import inside_cells
-from magshell_fenicsx.models.shell.strains import (
-    NaturalFrame,
-    TangentFrame,
-    bending_moment,
-    principal,
-)
+from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, principal
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
+from magshell_fenicsx.quantities.stresses import LAYERS
 
 Array = NDArray[np.float64]
 
@@ -198,81 +194,6 @@ def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -
     return Torque(g.n0, coefficients, g.dual, half_normal_Ba * in_surface)
 
 
-class Stresses:
-    """Membrane strains and bending moments at points (cells, points per cell) of a shell.
-
-    Parameters
-    ----------
-    r0
-        (6, cells, points, 3) jet of the placement: r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22.
-    material
-        Material of the shell.
-    thickness
-        (cells, points) factor of the thickness h; None for 1.
-    natural
-        The natural shape; None if the drawn shape is without stress.
-    made_of
-        (cells, 4) numbers of each cell's material: modulus over that of the first shell, Poisson's
-        ratio, density ratio, number of the law. None if all cells have `material`.
-
-    Attributes
-    ----------
-    frame
-        Tangent bases and normals of the undeformed surface at the points.
-
-    The field `_law` is the law of elasticity for the thickness h, `_thickness` the factor of h.
-    `_natural` are the tensors of the natural shape, None without one. `_unit` is the unit of
-    moments.
-    """
-
-    def __init__(
-        self,
-        r0: Array,
-        material: Material,
-        thickness: Array | None,
-        natural: Natural | None = None,
-        made_of: Array | None = None,
-    ) -> None:
-        """Set frames, law and natural shape at the points."""
-        self.frame = frame = TangentFrame.from_jet(r0)
-        self._thickness = thickness
-        self._law = material.law_in(made_of).at_point(
-            r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
-        )
-        self._natural = natural and natural.tensors_at(r0[0], self.frame.n0)
-        self._unit = material.bending_stiffness  # D of the thickness h, the unit of M
-
-    def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """Return strains and moments of a displacement at the points.
-
-        Parameters
-        ----------
-        u
-            (6, cells, points, 3) jet of the displacement over R.
-        mu
-            Amplitudes of the state.
-
-        Returns
-        -------
-        E, M
-            (..., 3) components 11, 12 and 22 of membrane strain and bending moment over D/R, with D
-            of the thickness h; the strain from the natural shape, if there is one.
-        E_total
-            The strain from the drawn shape, if there is a natural one.
-        """
-        frame = self.frame
-        E, K = frame.membrane_strain(u), frame.curvature_change(u)
-        law = self._law if self._thickness is None else self._law.thicker(self._thickness)
-        if not self._natural:
-            return {"E": E, "M": np.asarray(bending_moment(E, K, law) / self._unit)}
-        # stresses come from the strain beyond the natural shape, which grows with two amplitudes
-        shape = NaturalFrame.from_tensors(
-            frame, *self._natural, bent=mu.get(CURVATURE, 0.0), stretched=mu.get(STRETCH, 0.0)
-        )
-        elastic_strain, M = shape.elastic(E), shape.moment(E, K, law)
-        return {"E": elastic_strain, "M": np.asarray(M / self._unit), "E_total": E}
-
-
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
     """Return E_1, E_2, M_1, M_2 (...): the principal values of E and M, the larger first.
 
@@ -283,6 +204,21 @@ def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
         for name in ("E", "M")
         for number, values in enumerate(principal(components[name]), 1)
     }
+
+
+def mises_fields(fields: Mapping[str, Array]) -> dict[str, Array]:
+    """Return von Mises' stress (...) of the faces and the middle, of those that there are.
+
+    `fields` maps names such as "stress_top" to tensors of plane stress in space (..., 3, 3).
+    """
+    mises = dict[str, Array]()
+    for layer in LAYERS:
+        S = fields.get(f"stress_{layer}")
+        if S is not None:
+            trace = np.einsum("...ii->...", S)
+            square = 1.5 * np.einsum("...ij,...ij->...", S, S) - 0.5 * trace**2
+            mises[f"mises_{layer}"] = np.sqrt(np.maximum(square, 0.0))
+    return mises
 
 
 def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:

@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.polynomial_fit import exponents, monomials, polynomial_fits
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.output.fields.point_fields import in_frame, in_space, principal_fields
 
@@ -61,8 +62,6 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
 Numbers = NDArray[np.int64]
 # weight of the second ring of cells around a vertex at an edge, where the first ring has few
 SECOND_RING_WEIGHT = 0.03
-MIN_SAMPLES_PER_COEFFICIENT = 1.2  # of a polynomial
-RIDGE = 1e-10  # regularises fits whose samples lie on few lines
 
 
 class Recovery:
@@ -106,7 +105,7 @@ class Recovery:
         `values` and `columns` of all entries, row after row, and `starts`, where each row begins.
         """
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
-        self._coefficient_count = count = len(_powers(cells.shape[1] - 1, degree))
+        self._coefficient_count = count = len(exponents(cells.shape[1] - 1, degree))
         self._patch_size = np.ones(len(vertices))  # set by the fits below
         samples_per_cell = weight.shape[1]
         # the cells around each vertex as a sparse pattern (v, m), and the weight of each entry
@@ -174,7 +173,7 @@ class Recovery:
         )
         scaled_coordinates = local_coordinates / self._patch_size[vertices_of_cells][..., None]
         # monomials at the place, times the blend weight of the vertex
-        values = _monomials(scaled_coordinates, self._degree) * barycentric[..., None]
+        values = monomials(scaled_coordinates, self._degree) * barycentric[..., None]
         columns = _members(vertices_of_cells, self._coefficient_count)  # numbers of coefficients
         starts = np.arange(len(cell) + 1) * columns[0].size  # where each row begins
         return scipy.sparse.csr_matrix(
@@ -184,9 +183,6 @@ class Recovery:
 
     def _fit_matrices(self, vertex: Numbers, samples: Array, weight: Array) -> Array:
         """Return the least-squares fits around vertices, and set the sizes of their patches.
-
-        The degree is lowered until there are enough samples; there are fewer coefficients then. A
-        small ridge keeps a fit regular even if its samples lie on few lines.
 
         Parameters
         ----------
@@ -202,23 +198,10 @@ class Recovery:
         n = len(vertex)
         offsets = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[vertex][:, None]
         local_coordinates = offsets @ np.swapaxes(self._frames[vertex], 1, 2)
-        self._patch_size[vertex] = np.abs(local_coordinates).max(axis=(1, 2))
-        _, sample_count, dimensions = local_coordinates.shape
-        degree = _affordable_degree(self._degree, dimensions, sample_count)
-        scaled_coordinates = local_coordinates / self._patch_size[vertex][:, None, None]
-        monomials = _monomials(scaled_coordinates, degree)  # (n, samples, coefficients)
-        weight = weight.reshape(n, -1)
-        weight_roots = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
-        coefficient_count = monomials.shape[-1]
-        ridge = np.broadcast_to(
-            RIDGE * np.eye(coefficient_count), (n, coefficient_count, coefficient_count)
+        fits, self._patch_size[vertex] = polynomial_fits(
+            local_coordinates, weight.reshape(n, -1), self._degree
         )
-        # below the samples the ridge has rows of its own, whose values are zero. A QR factorisation
-        # keeps the condition small, where normal equations would square it
-        Q, upper_triangle = np.linalg.qr(np.concatenate([weight_roots * monomials, ridge], axis=1))
-        Q_of_samples = Q[:, :sample_count]  # the ridge's rows, with values of zero, are left out
-        fits = np.linalg.solve(upper_triangle, np.swapaxes(Q_of_samples * weight_roots, 1, 2))
-        return np.asarray(fits)
+        return fits
 
 
 def _members(groups: Numbers, group_size: int) -> Numbers:
@@ -228,16 +211,6 @@ def _members(groups: Numbers, group_size: int) -> Numbers:
     group 2 has the members 6, 7 and 8.
     """
     return np.asarray(groups[..., None] * group_size + np.arange(group_size))
-
-
-def _affordable_degree(degree: int, dimensions: int, sample_count: int) -> int:
-    """Return the degree, lowered until there are more samples than coefficients.
-
-    `dimensions` is the number of the polynomial's variables.
-    """
-    while degree and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(dimensions, degree)) > sample_count:
-        degree -= 1
-    return degree
 
 
 def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Array]:
@@ -273,27 +246,6 @@ def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Arr
     patches = (first_ring + second_ring).tocsr()
     # entries of the first ring are at least one
     return patches, np.where(patches.data > SECOND_RING_WEIGHT, 1.0, SECOND_RING_WEIGHT)
-
-
-def _powers(dimensions: int, degree: int) -> list[tuple[int, ...]]:
-    """Return the exponents of all monomials up to `degree` in one or two variables."""
-    if dimensions == 1:
-        return [(n,) for n in range(degree + 1)]
-    return [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
-
-
-def _monomials(y: Array, degree: int) -> Array:
-    """Return the values (..., coefficients) of all monomials up to `degree` at y (..., d)."""
-    # of each variable its powers (..., degree + 1)
-    powers = list[Array]()
-    for x in np.moveaxis(y, -1, 0):
-        powers_of_variable = [x**n for n in range(degree + 1)]
-        powers.append(np.stack(powers_of_variable, axis=-1))
-    monomials = []
-    for exponents in _powers(len(powers), degree):
-        factors = [power[..., n] for power, n in zip(powers, exponents, strict=True)]
-        monomials.append(np.prod(factors, axis=0))
-    return np.stack(monomials, axis=-1)
 
 
 SYMMETRIC_COMPONENTS = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # indices of a symmetric tensor

@@ -34,7 +34,7 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.law import Law, LawByShell
 from magshell_fenicsx.models.shell.spatial_fields import inside_cells
 from magshell_fenicsx.output.fields.contact_peak import ContactPeak, contact_peak
-from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, rubber_fields
+from magshell_fenicsx.output.fields.point_fields import PointFields, mises_fields, rubber_fields
 from magshell_fenicsx.output.fields.recovery import (
     RecoveredShell,
     components_in_space,
@@ -42,6 +42,7 @@ from magshell_fenicsx.output.fields.recovery import (
     split,
 )
 from magshell_fenicsx.shape.drawn_bodies import Solid
+from magshell_fenicsx.shells.stresses import Stresses
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -85,8 +86,9 @@ class Surface:
         tensors in space that are tangent to the undeformed surface. E_total: the strain from the
         drawn shape, where there is a natural shape. E_1, E_2, M_1, M_2: principal values of E and
         M, the larger first. w0_over_h: the imperfections, where there are some; a solid has no
-        other field. Further names are those of `point_fields.PointFields` and
-        `point_fields.rubber_fields`.
+        other field. Further names are those of `point_fields.PointFields`,
+        `point_fields.rubber_fields` and, where stresses are wanted, `Stresses.forces_of` and
+        `point_fields.mises_fields`.
     outlines
         Places (n, 3) along lines that outline the sources of the applied field, and bodies.
     jump
@@ -337,9 +339,10 @@ class SurfaceGatherer:
         }
         u_at_nodes, law = self._averaged(jet[0]), self._law_at_nodes()
         # fields that are recovered from samples in cells: strains and moments
-        stresses = self._stresses.values_of(
-            self._jet(self._model.u, self._reference_samples), state.mu
-        )
+        u_at_samples = self._jet(self._model.u, self._reference_samples)
+        stresses = self._stresses.values_of(u_at_samples, state.mu)
+        if self._model.loads.stress:
+            stresses |= self._stresses.forces_of(u_at_samples, state.mu)
         tensors = {
             name: self._gather_cells(np.einsum("...ia,...a->...i", self._to_space, S))
             for name, S in stresses.items()
@@ -347,7 +350,8 @@ class SurfaceGatherer:
         if not self._recovered:  # on other ranks than 0
             return None
         recovered, jumps = self._recovered.fields(tensors, self._n0)
-        fields = self._constant | recovered | rubber_fields(recovered, law) | averaged
+        recovered |= rubber_fields(recovered, law) | mises_fields(recovered)
+        fields = self._constant | recovered | averaged
         # contact pressure only where the mesh resolves it
         fields = resolved_pressure(self._cells, fields)
         return Surface(

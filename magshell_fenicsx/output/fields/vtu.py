@@ -33,6 +33,7 @@ from magshell_fenicsx.output.store.durable import damage, errors_as_damage, writ
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.parts.magnetism.fields import FIELD
 from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
+from magshell_fenicsx.quantities.stresses import LAYERS
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -54,6 +55,8 @@ UNITS = {  # of the arrays, for those who open the files in other programs
     **dict.fromkeys(("M", "M_1", "M_2"), "D/R"),
     **dict.fromkeys(("p_mag", "f_mag"), f"E {STRENGTH}"),
     **dict.fromkeys(("k", "tau"), f"h E {STRENGTH}"),
+    "N": "E h",
+    **dict.fromkeys((f"{name}_{layer}" for layer in LAYERS for name in ("stress", "mises")), "E"),
     "Br": "largest remanence",
     "Ba": "mu0 E / largest remanence",
     "contact_pressure": "E h/R",

@@ -150,8 +150,10 @@ COLUMN_ORDER = (
     "place",
     "reaction",
     "moment",
+    "stress",
     "count",
 )
+MOST_TOLD = 4  # instabilities of the last step that a sentence names
 # kind -> unit, of a path.csv without columns in units
 UNIT_OF_KIND = {"place": "m", "reaction": "N", "moment": "N m"}
 
@@ -348,6 +350,7 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         entry = entries[min(located(lines).index(first_instability), len(entries) - 1)]
         mode_at = entry.get("mode_at")  # the place at which the mode is largest
         sentences.append(_instability(first_instability, summary, lines, mode_at))
+        sentences += _instabilities_of_last_step(first_instability, summary, lines)
     if solutions := summary.get("solutions"):
         stable = sum(solution["stable"] for solution in solutions)
         noun = "further solution" + "s" * (len(solutions) != 1)
@@ -521,10 +524,7 @@ def _instability(
     mode_at
         Place (3,) over R at which the mode is largest; None if unknown.
     """
-    kind = line["label"]  # "fold" or "bifurcation", then the mode in brackets
-    if line["mode"]:  # a number of waves, or a symmetry in words
-        is_wave = line["mode"] not in (*OWN_MODES, ANTISYMMETRIC)
-        kind += f" ({line['mode']}{' waves' if is_wave else ''})"
+    kind = _kind(line)
     load = value(line, summary, _errors_of_load(line, summary))
     displacement = _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
@@ -534,6 +534,45 @@ def _instability(
     else:
         sentence = "The first instability on the path is at {}: a {}, {}."
     return Markup(sentence).format(load, kind, displacement + _place_of_mode(mode_at, summary))
+
+
+def _kind(line: Line) -> str:
+    """Return the kind of an instability in words: fold or bifurcation, with its mode in brackets.
+
+    The mode is a number of waves, or a symmetry in words.
+    """
+    if not line["mode"]:
+        return line["label"]
+    is_wave = line["mode"] not in (*OWN_MODES, ANTISYMMETRIC)
+    return f"{line['label']} ({line['mode']}{' waves' if is_wave else ''})"
+
+
+def _instabilities_of_last_step(
+    first: Line, summary: Summary, lines: Sequence[Line]
+) -> list[Markup]:
+    """Return a list with one sentence on the instabilities of the last step of a programme.
+
+    It is empty if the first instability of the path, which is told already, is in this step. Of
+    many the first ones are named and the last one.
+    """
+    last_step = lines[-1].get("step", "")
+    told = [
+        line for line in located(lines) if line["branch"] == "0" and line.get("step") == last_step
+    ]
+    if not told or first in told:
+        return []
+    count = len(told)
+    if count > MOST_TOLD:
+        told = [*told[: MOST_TOLD - 1], told[-1]]
+    texts = [Markup("a {} at {}").format(_kind(line), value(line, summary)) for line in told]
+    if count > MOST_TOLD:
+        texts[-1] = Markup("..., {}").format(texts[-1])
+    noun = "instability" if count == 1 else f"{count} instabilities"
+    return [
+        Markup("Step {}, the last, has {}: {}.").format(
+            last_step, f"an {noun}" if count == 1 else noun, Markup(", ").join(texts)
+        )
+    ]
 
 
 def _errors_of_load(line: Line, summary: Summary) -> dict[str, float]:

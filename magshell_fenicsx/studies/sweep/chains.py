@@ -16,6 +16,8 @@ from mpi4py import MPI
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.runs.running import Result, run
+from magshell_fenicsx.simulate.gradients.instabilities import LostResult
+from magshell_fenicsx.simulate.gradients.results import vibration_at_end
 from magshell_fenicsx.simulate.scene_cache import SceneCache
 from magshell_fenicsx.studies.folds import Continuation, has_knockdown, result_of_fold, scene_of
 from magshell_fenicsx.studies.outcome import Outcome, outcome_of
@@ -134,6 +136,9 @@ class SweepCache:
     ----------
     columns
         Columns of path.csv that the outcomes of all runs keep.
+    frequency
+        Name of a natural frequency, such as "hertz_1", that the last point of each path gets; empty
+        without.
     scenes
         The scenes that were used last.
     first
@@ -142,6 +147,7 @@ class SweepCache:
     """
 
     columns: Sequence[str]
+    frequency: str = ""
     scenes: SceneCache = field(
         default_factory=partial(SceneCache, MPI.COMM_SELF, max_unknowns=MOST_UNKNOWNS)
     )
@@ -149,7 +155,7 @@ class SweepCache:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what makes an empty cache in another process: scenes belong to theirs."""
-        return type(self), (self.columns,)
+        return type(self), (self.columns, self.frequency)
 
 
 def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[SweepPoint, Outcome]]:
@@ -175,7 +181,7 @@ def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[SweepPoint, Out
             )
         if not outcome:
             outcome, continuation = _by_path(
-                link, folds.columns, factorisations, start_time, go_on=not is_last
+                link, folds, factorisations, start_time, go_on=not is_last
             )
         if is_first:
             # a continuation without earlier folds, for this chain and for the begin of the next
@@ -228,12 +234,14 @@ def _by_fold(
 
 
 def _by_path(
-    link: Link, columns: Sequence[str], factorisations: int, start: float, *, go_on: bool
+    link: Link, folds: SweepCache, factorisations: int, start: float, *, go_on: bool
 ) -> tuple[Outcome, Continuation | None]:
     """Compute the full path of a point of a chain.
 
     Parameters
     ----------
+    folds
+        Says what the outcome keeps.
     factorisations
         Number of factorisations that earlier attempts at the point took.
     start
@@ -255,7 +263,21 @@ def _by_path(
     continuation = _continuation_from(link.at, result) if go_on else None
     work = factorisations + result.scene.newton.factorisation.count
     estimates, wall_s = result.error_estimates, time.perf_counter() - start
-    return outcome_of(result, "path", work, wall_s, columns, estimates), continuation
+    outcome = outcome_of(result, "path", work, wall_s, folds.columns, estimates)
+    if folds.frequency:
+        outcome.curve[result.end] |= _frequency_at_end(result, folds.frequency)
+    return outcome, continuation
+
+
+def _frequency_at_end(result: Result, name: str) -> dict[str, float]:
+    """Return a natural frequency where a run ended, by its name; empty if it has none."""
+    if result.stopped:
+        return {}
+    try:
+        value = vibration_at_end(result.scene, result.path_history, name)
+    except LostResult:
+        return {}
+    return {} if value is None else {name: value}
 
 
 def _continuation_from(parameter: float, result: Result) -> Continuation | None:

@@ -27,6 +27,7 @@ from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.quantities.quantity import number_with_error
 from magshell_fenicsx.quantities.registry import endings, field_columns
+from magshell_fenicsx.simulate.gradients.vibration import refuse_no_vibration
 from magshell_fenicsx.studies.outcome import Outcome
 from magshell_fenicsx.studies.points import (
     MOST_POINTS,
@@ -146,12 +147,16 @@ def sweep(  # noqa: PLR0913 - what a user gives
     DiskError
         If the tables cannot be written.
     """
-    axes, scalar = parse_axes(over), parse_scalar(result) if result else None
+    axes = parse_axes(over)
+    scalar = parse_scalar(result, with_frequencies=True) if result else None
     # other numbers than a knockdown need the path
     is_another_number = scalar is not None and scalar.name != "knockdown"
     full_paths = full_paths or is_another_number
     source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
     requested = on_first_rank(comm, lambda: make_points(source, axes, make_case))
+    frequency = scalar.column if scalar and scalar.is_frequency else ""
+    if frequency:
+        refuse_no_vibration(requested[0].case.problem(), frequency)
     share = share_of(part, len(requested))
     folder = FOLDER.prepare(user_folder(out), comm)
     # points of earlier sweeps in the folder come first, then the requested ones
@@ -175,7 +180,7 @@ def sweep(  # noqa: PLR0913 - what a user gives
         store,
         scalar,
         {point.key: number for number, point in enumerate(missing, 1)},
-        SweepCache(columns=COLUMNS if scalar else CURVE),
+        SweepCache(COLUMNS if scalar else CURVE, frequency),
     )
     chains = make_chains(axes, points, missing, full_paths=full_paths)
     compute(chains, run, comm, say, executor)

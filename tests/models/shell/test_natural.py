@@ -17,8 +17,9 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import principal_fields
 from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.shells.stresses import Stresses
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 STRIP = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0}

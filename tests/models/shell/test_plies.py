@@ -14,11 +14,11 @@ from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.laminate import Laminate
 from magshell_fenicsx.models.shell.parameters import Condition, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.output.fields.point_fields import Stresses
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.shape import Natural, meridians
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.stresses import Stresses
 
 ISOTROPIC = {"E2": 1.0, "nu12": 0.3, "G12": 1 / 2.6}
 ALIKE = laminate(ply(17, 1.0, 0.4, **ISOTROPIC), ply(-60, 1.0, **ISOTROPIC))

@@ -12,11 +12,12 @@ from magshell_fenicsx import Case, Scene, surface
 from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
-from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import principal_fields
 from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel
+from magshell_fenicsx.shells.stresses import Stresses
 from magshell_fenicsx.simulate.follow import follow
 
 NU, H = 0.3, 0.05
