@@ -689,7 +689,8 @@ class Problem(problem.Problem, metaclass=_ProblemType):
         programme in this order; before a single one the natural shape grows and the field is
         applied.
     points
-        Name -> place, in the lengths of the shell; of a mesh a vertex, in its coordinates.
+        Name -> place: texts with a unit such as "2 mm", or numbers in metres, or without units in
+        the lengths of the shell; on a mesh a vertex.
     degree
         Polynomial degree of the displacement.
     symmetry

@@ -262,7 +262,7 @@ def columns(scene: Scene, records: Iterable[Record] | Record) -> Table:
     Raises
     ------
     ValueError
-        If the arguments are in another order.
+        If the arguments are in another order, or a record is of another model.
     """
     records = list(records) if isinstance(records, Iterable) else [records]
     Scene.refuse_other_arguments("columns", scene, records)

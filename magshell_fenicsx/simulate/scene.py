@@ -497,8 +497,15 @@ class Scene:
         if not isinstance(scene, Scene) or not all(isinstance(each, Record) for each in records):
             raise ValueError(f"{name}: give the model first, then what follow or trace yield")
         # models of one run, from which modes lead into others, share its journal
-        scenes = [record.scene for record in records if isinstance(record, Record)]
-        if any(other and other.journal is not scene.journal for other in scenes):
+        foreign_records = [
+            record
+            for record in records
+            if isinstance(record, Record)
+            and record.scene
+            and record.scene.journal is not scene.journal
+        ]
+        if foreign_records:
+            scene.refuse_foreign(foreign_records[0].point.state)  # says in what they differ
             raise ValueError(
                 f"{name}: a record is of another model: give record.scene in place of the model"
             )

@@ -45,7 +45,6 @@ from magshell_fenicsx.python_keys import (
     SpinKeys,
     TimeKeys,
 )
-from magshell_fenicsx.simulate.record import Record
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
@@ -385,7 +384,9 @@ def test_mistakes_in_problems(make: Callable[[], Any], message: str) -> None:
             "trace: steps: 0: give a number from 1 on",
         ),
         (
-            lambda model: ms.columns(model, Record("start", "", None).with_scene(ms.Model(FILE))),  # type: ignore[arg-type]
+            lambda model: ms.columns(
+                model, list(ms.trace(ms.Model(FILE), "pressure", targets=0.1))
+            ),
             "columns: a record is of another model: give record.scene in place of the model",
         ),
         (lambda model: ms.columns([], model), "columns: give the model first, then what follow"),
