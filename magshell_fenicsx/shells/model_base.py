@@ -267,6 +267,28 @@ class ModelBase:
         rows[np.arange(3), unknowns] = factors[:, None]
         return rows
 
+    def stresses(self, state: State) -> dict[str, StressState]:
+        """Return name -> stresses at the points of `stress`, none of a solid; collective.
+
+        Raises
+        ------
+        MeshError
+            On every rank, if they have no single value at a point.
+        """
+        from magshell_fenicsx.shells.stress_points import (  # of few runs
+            meridian_stresses,
+            shell_stresses,
+        )
+
+        at_point: Any = shell_stresses if self.midsurface else meridian_stresses
+        points = self.loads.stress.points if self.loads.stress else ()
+
+        def at_points() -> dict[str, StressState]:
+            """Return the stresses at the system's state."""
+            return {point.name: at_point(self, point, state.mu) for point in points}
+
+        return self.system.at_state(state).evaluate(at_points)
+
     def region(self, state: State, approach: str) -> Region:
         """Return the region where a body touches the shell; collective.
 
@@ -412,28 +434,6 @@ class ThinModel(ModelBase):
     @property
     def law_of_cells(self) -> Law:
         return self.factory.law_of_cells
-
-    def stresses(self, state: State) -> dict[str, StressState]:
-        """Return name -> stresses at the points at which they are read; collective.
-
-        Raises
-        ------
-        MeshError
-            On every rank, if they have no single value at a point.
-        """
-        from magshell_fenicsx.shells.stress_points import (  # of few runs
-            meridian_stresses,
-            shell_stresses,
-        )
-
-        at_point: Any = shell_stresses if self.midsurface else meridian_stresses
-        points = self.loads.stress.points if self.loads.stress else ()
-
-        def at_points() -> dict[str, StressState]:
-            """Return the stresses at the system's state."""
-            return {point.name: at_point(self, point, state.mu) for point in points}
-
-        return self.system.at_state(state).evaluate(at_points)
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
         """Return the function that integrates an expression over the undeformed area."""
