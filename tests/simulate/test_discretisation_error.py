@@ -130,7 +130,7 @@ def test_force_at_a_depth() -> None:
 
 
 def test_a_narrow_contact_has_no_estimate_of_its_pressure() -> None:
-    """Under the edge of a rod the largest pressure grows with each finer mesh; the force does not."""
+    """Under the edge of a rod the largest pressure grows with finer meshes, the force does not."""
     result = coarse_run("rod_contact.yaml", "loading.approach=1", "loading.points=1")
     assert "force@end" in result.errors
     assert not any("pressure_max" in name for name in result.errors)
