@@ -155,6 +155,7 @@ def test_half_of_a_turned_profile() -> None:
     assert displacements[0] == pytest.approx(displacements[1], rel=1e-3, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_waves_under_a_fluid() -> None:
     """A cylinder buckles in waves where a sector of a surface buckles; it is the inertia there."""
     case = {
@@ -171,6 +172,7 @@ def test_waves_under_a_fluid() -> None:
     assert pressures[0] == pytest.approx(pressures[1], rel=2e-3)
 
 
+@pytest.mark.slow
 def test_sensitivity_of_a_fold() -> None:
     """The fold of a shell with a flaw, by the size of the flaw: against two folds found again."""
 
