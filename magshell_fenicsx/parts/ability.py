@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Kind = TypeVar("Kind")
 AnyStep = TypeVar("AnyStep", bound="Step")
+# whose directions in the surface are given by e1: there is no meridian about e3
+GEOMETRIES_WITHOUT_MERIDIAN = ("strip", "plate", "mesh")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_valida
 
 from magshell_fenicsx.input.section import Section, case_sizes, or_number
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.ability import Ability, Context
+from magshell_fenicsx.parts.ability import GEOMETRIES_WITHOUT_MERIDIAN, Ability, Context
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, no_plane, unit
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0)]
 Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
 MERIDIAN = "meridian"
-FLAT = ("strip", "plate", "mesh")
 STIFFNESS_TOLERANCE = 1e-12  # over the largest stiffness: what is left where plies cancel
 VOIGT_INDICES = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])  # of the entries 11, 12, 22, 16, 26, 66
 TWISTING_ENTRIES = [3, 4]  # 16 and 26
@@ -185,7 +184,7 @@ class LaminateSection(Section):
         It is None if the angle 0 is along the meridians. The default depends on the shell's
         `geometry`.
         """
-        is_meridian_by_default = self.along is None and geometry not in FLAT
+        is_meridian_by_default = self.along is None and geometry not in GEOMETRIES_WITHOUT_MERIDIAN
         if self.along == MERIDIAN or is_meridian_by_default:
             return None
         return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))

@@ -16,14 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.ability import Ability, Context, Modelled
-from magshell_fenicsx.parts.laminate import FLAT
-from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.parts.ability import (
+    GEOMETRIES_WITHOUT_MERIDIAN,
+    Ability,
+    Context,
+    Modelled,
+)
 from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.quantities.stresses import stress_columns
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.parts.loads import Loads
 
 Array = NDArray[np.float64]
 LEAST_SINE = 1e-6  # of a direction and the normal: below, the direction has no part in the surface
@@ -128,8 +132,10 @@ class StressPoints(Ability):
             hint="of rubber fields/ have stretches and true stresses, sigma_1 and sigma_2",
         )
 
-    def contribution(self, context: Context, modelled: Modelled) -> Loads:
+    def contribution(self, context: Context, modelled: Modelled) -> "Loads":
         """Return the points in the frame of the model."""
+        from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
+
         shell, Q = context.shell, rotation(modelled.turn)
         along = self._direction(context)
         vectors = np.array([*([] if along is None else [along]), *np.eye(3)]) @ Q.T
@@ -152,13 +158,13 @@ class StressPoints(Ability):
         shell = context.shell
         if shell.laminate:
             return shell.laminate.direction(shell.geometry)
-        return np.eye(3)[0] if shell.geometry in FLAT else None
+        return np.eye(3)[0] if shell.geometry in GEOMETRIES_WITHOUT_MERIDIAN else None
 
 
 class StressObservables(Observables):
     """Membrane forces, moments, shear forces and stresses at named points."""
 
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return loads.stress.columns if loads.stress else ()
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:

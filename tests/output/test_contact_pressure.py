@@ -149,8 +149,8 @@ def test_the_note_has_the_error_of_the_mesh(label: str, point: int) -> None:
         return pressure_note(with_contact_errors(surface, cast("PicturedRun", run)))
 
     is_last = point == 2
-    assert ("$pR/(Eh)$ = 4, with an error of 5 % by the mesh" in note(2.0)) == is_last
-    assert ("0.5 $Eh$, with an error of 1 % by the mesh" in note(np.nan)) == is_last
+    assert ("$pR/(Eh)$ = 4, with an error of 5\u00a0% by the mesh" in note(2.0)) == is_last
+    assert ("0.5 $Eh$, with an error of 1\u00a0% by the mesh" in note(np.nan)) == is_last
 
 
 def test_nothing_touches() -> None:

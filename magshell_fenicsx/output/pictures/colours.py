@@ -390,7 +390,7 @@ def _error_text(relative_error: float) -> str:
     """Return words on an estimated relative error, behind a number; none if it is unknown."""
     if isnan(relative_error):
         return ""
-    return f", with an error of {100 * relative_error:.1g} % by the mesh"
+    return f", with an error of {100 * relative_error:.1g}\u00a0% by the mesh"
 
 
 def contact_region(surface: Surface) -> Array | None:

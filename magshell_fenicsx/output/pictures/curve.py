@@ -66,7 +66,7 @@ STRAIGHTNESS_TOLERANCE = 0.005  # distance from the chord over the extent, of a 
 ARROW_LENGTH, MIN_LENGTH_OF_WAY = 8.0, 24.0  # pixels: of an arrow, and of a step with an arrow
 INSET_SIZE = 0.4  # of the axes
 INSET_GAP = 0.14  # of the axes: room for the numbers of the inset
-MAX_COVERED = 0.02  # of the points of all curves, that an inset may cover
+MAX_COVERED = 0.03  # of the points of all curves, that an inset may cover
 
 
 def curve_figure(

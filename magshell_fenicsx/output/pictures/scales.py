@@ -105,7 +105,7 @@ def round_limits(low: float, high: float) -> tuple[float, float]:
     Examples
     --------
     >>> round_limits(1.048, 1.153)
-    (1.04, 1.16)
+    (1.0, 1.2)
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -53,6 +53,7 @@ class UprightSection:
         for lines, colour, width in ((self.undeformed, "0.65", 0.8), (self.deformed, "0.1", 1.2)):
             collection = LineCollection(list(lines), colors=colour, linewidths=width)
             collection.set_capstyle("round")
+            collection.set_clip_on(False)  # the box is that of the lines without their width
             axes.add_collection(collection, autolim=False)
         left, right, low, high = self.box
         axes.set(xlim=(left, right), ylim=(low, high))
