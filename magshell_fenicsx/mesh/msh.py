@@ -436,8 +436,12 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
     # reversing exchanges the second and the third vertex
     is_reversed = (cells[:, 1] != cells_of_file[:, 1]).astype(np.int64)
     curves, edges = edges, border_edges(nodes, cells, edges)
-    within = {name: pairs for name, pairs in curves.items() if name not in edges}
-    inner_lines = among(within, inner_pairs(directed_sides(cells)))
+    inner_lines = among(curves, inner_pairs(directed_sides(cells)))
+    for name in inner_lines.keys() & edges.keys() - t_junctions.keys():
+        raise MeshError(
+            f"{file.path}: the physical curve {name}: is at the edge of the surface in part, and "
+            "within it in part: make two curves of it"
+        )
     nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])

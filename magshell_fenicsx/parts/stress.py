@@ -122,7 +122,7 @@ class StressPoints(Ability):
         return None if names is None else cls(names)
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse unknown points, a solid, and rubber, with a ValueError."""
+        """Refuse unknown points, a solid, rubber, and growth, with a ValueError."""
         for i, name in enumerate(self.names):
             context.has_point(f"stress.{i}", name)
         context.needs("stress", "a mid-surface")
@@ -131,6 +131,12 @@ class StressPoints(Ability):
             "a thickness that does not change",
             hint="of rubber fields/ have stretches and true stresses, sigma_1 and sigma_2",
         )
+        natural = context.sections.get("natural")
+        if natural and natural.stretch is not None:
+            raise ValueError(
+                "stress: not beside natural.stretch: forces per length are those of the drawn "
+                "surface, which is not the grown one"
+            )
 
     def contribution(self, context: Context, modelled: Modelled) -> "Loads":
         """Return the points in the frame of the model."""

@@ -44,7 +44,12 @@ from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import meridian_openings, side_field, side_of
+from magshell_fenicsx.parts.pressure.openings import (
+    ends_within,
+    meridian_openings,
+    side_field,
+    side_of,
+)
 from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
 from magshell_fenicsx.parts.supports.support_motion import (
     PRESSURE,
@@ -323,10 +328,12 @@ class MeridianModel(ThinModel):
         free_ends, self.without_potential = meridian_openings(
             meridian, self.conditions, loads.pressed_sides
         )
+        is_enclosed = enclosed(loads, free_ends, self.without_potential)
+        self.without_potential += ends_within(factory.pressed_sides)
         if loads.pressure:
             energy = factory.pressure(loads.pressure_profile, potential=not self.without_potential)
             self.energies.append(energy)
-        return enclosed(loads, free_ends, self.without_potential)
+        return is_enclosed
 
     def _add_forces(self) -> None:
         """Add the energies of forces at the pole and of dead loads to `energies`.

@@ -74,6 +74,7 @@ from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import (
     edge_openings,
+    ends_within,
     pressed_parts,
     side_field,
     sides_of_cells,
@@ -491,7 +492,9 @@ class ShellModel(ThinModel):
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
         # names of edges that move, and of those among them where a pressure has no potential
         free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
-        return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
+        is_enclosed = enclosed(self.loads, free_edges, self.without_potential)
+        self.without_potential += ends_within(pressed_cells)
+        return opening_edges, is_enclosed
 
     def _volume_form(self, origin: NDArray[np.float64] | None, *, is_enclosed: bool) -> ufl.Form:
         """Return the form of Delta V/R^3 of the modelled part.

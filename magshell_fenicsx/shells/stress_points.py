@@ -137,10 +137,12 @@ def point_of_shell(model: "ShellModel", point: StressPoint) -> PointInCells:
     MeshError
         On every rank, if it is not on the surface, or where different parts of it meet.
     """
-    of_shell = None
+    place, of_shell = point.place, None
     if point.name in model.midsurface.points:  # of several shells one may be meant
         of_shell = model.midsurface.cells_of_point(point.name)
-    cells, reference, distance = nearest_in_cells(model.r0, point.place, of_shell)
+        # where an imperfection has moved the vertex of the perfect shell
+        place = model.displacement(model.r0.x.array, point.name)
+    cells, reference, distance = nearest_in_cells(model.r0, place, of_shell)
     if distance > LARGEST_DISTANCE:
         raise MeshError(
             f"stress: {point.name}: is {distance:.2g} times the size of a cell away from the "

@@ -224,3 +224,32 @@ def test_refused(loading: dict[str, Any], message: str) -> None:
 def test_refused_beside_a_profile(step: dict[str, Any], message: str) -> None:
     with pytest.raises(CaseError, match=message):
         make_problem(capped(loading=[loaded("z"), step]))
+
+
+def test_a_pressed_part_that_ends_within_the_surface() -> None:
+    """The vertical force on the lower one of two joined tubes is p pi (rho_top^2 - 1), whatever its
+    shape: at its moving border a live pressure has no potential, and is a follower load."""
+    tube = {
+        "geometry": "cylinder", "radius": 1, "length": 0.6, "thickness": 0.02,
+        "youngs_modulus": 1, "poisson_ratio": 0.3,
+    }  # fmt: skip
+    scene = Scene(
+        Case.from_source({
+            "shells": {
+                "lower": {"shell": tube, "boundary": {"bottom": "clamped"},
+                          "points": {"border": [1, 0, 0.6]}},
+                "upper": {"shell": tube, "place": {"position": [0, 0, 0.6]}},
+            },
+            "joints": [{"edges": ["lower.top", "upper.bottom"]}],
+            "loading": {"kind": "pressure", "on": {"lower": "inside"}, "control": "load",
+                        "pressure": 4, "until": "target", "points": 1},
+            "reactions": True,
+            "mesh": {"degree": 4, "refinement": 0.5},
+        })
+    )  # fmt: skip
+    *_, record = follow(scene)
+    row = scene.observe(record.point.state)
+    rho = 1 + row["lower_border_ux"]
+    pressure = row["p_over_pc"] * scene.model.material.classical_pressure
+    assert rho > 1.001
+    assert row["lower_bottom_fz"] == pytest.approx(pressure * np.pi * (rho**2 - 1), rel=1e-6)

@@ -8,7 +8,8 @@ plane: then the pressure has a potential, `densities.swept_volume`. Elsewhere it
 
 A live pressure turns with the surface and follows its area. An edge is closed if it is held or lies
 in a plane of symmetry; a moving edge is one with a part that is not. Openings are the moving edges,
-with those of them at which the pressure has no potential. The side of a cell or shell is the face
+with those of them at which the pressure has no potential. So is the border of a pressed part within
+the surface. The side of a cell or shell is the face
 that is pressed: 1 outside, -1 inside, 0 none. On a meridian, the curve of a shell of revolution, an
 edge is an end.
 """
@@ -17,6 +18,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
@@ -25,6 +27,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 
 Array = NDArray[np.float64]
+INNER_BORDER = "where the pressed part ends"  # in place of an edge's name
 
 
 def moving_edges(
@@ -141,6 +144,23 @@ def side_field(sides: Mapping[str, float], midsurface: Midsurface | Meridian) ->
 def sides_of_cells(side_of_cells: fem.Function) -> Array:
     """Return the values of a `side_field` as an array (cells,)."""
     return np.asarray(side_of_cells.x.array[side_of_cells.function_space.dofmap.list[:, 0]])
+
+
+def ends_within(side_of_cells: fem.Function | None) -> tuple[str, ...]:
+    """Return `INNER_BORDER` if a pressed part ends within the surface, else nothing; collective.
+
+    There the surface moves, and a live pressure has no potential. `side_of_cells` is a
+    `side_field`, or None where all is pressed from outside.
+    """
+    if side_of_cells is None:
+        return ()
+    mesh, sides = side_of_cells.function_space.mesh, sides_of_cells(side_of_cells)
+    dim = mesh.topology.dim
+    mesh.topology.create_connectivity(dim - 1, dim)
+    cells_of_facets = mesh.topology.connectivity(dim - 1, dim)
+    facets = range(cells_of_facets.num_nodes)
+    is_there = any(np.ptp(sides[cells_of_facets.links(facet)]) > 0 for facet in facets)
+    return (INNER_BORDER,) if mesh.comm.allreduce(is_there, MPI.LOR) else ()
 
 
 def pressed_parts(
