@@ -154,6 +154,7 @@ def estimate_errors(
                 f"{column}@end": _estimated(change) for column, change in changes.items() if change
             }
             _leave_out_narrow_pressure(estimates, end.scene or scene, end.point.state)
+            _leave_out_stresses(estimates, end.scene or scene)
     steps = scene.problem.programme
     if steps and steps[-1].until == "zero" and history.begin and history.last:
         with estimates.naming("barrier"):
@@ -216,6 +217,23 @@ def _leave_out_narrow_pressure(estimates: ErrorEstimates, scene: Scene, state: S
     for name in names:
         del estimates.errors[name]
     estimates.reasons[f"{PRESSURE_MAX}@end"] = "the contact is narrower than a cell of the mesh"
+
+
+def _leave_out_stresses(estimates: ErrorEstimates, scene: Scene) -> None:
+    """Leave out the errors of forces, moments and stresses at points.
+
+    They are fitted to the cells around a point. One degree more shares the error of the fit, which
+    at an edge may be larger than that of the mesh by orders of magnitude.
+    """
+    reading = scene.problem.loads.stress
+    if not reading or not reading.columns:
+        return
+    columns = tuple(reading.columns)
+    for name in [*estimates.errors]:
+        column = name.removesuffix("@end")
+        if column in columns or column.startswith(tuple(f"{c}_" for c in columns)):
+            del estimates.errors[name]
+    estimates.reasons["stress@end"] = "stresses at points are fitted: compare with a finer mesh"
 
 
 def _estimated(change: float, load_error: float = 0.0) -> float:
