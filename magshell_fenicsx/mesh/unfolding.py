@@ -251,6 +251,10 @@ def unfold(
     new_number[used] = np.arange(len(used))
 
     edges = _edges_of_copies(patch, new_number[representative], count, end_names)
+    inner_lines = {
+        name: np.concatenate([new_number[representative[k * n + pairs]] for k in range(count)])
+        for name, pairs in patch.inner_lines.items()
+    }
     is_glued = has_own_nodes or patch.representative is not None
     source_triangles = patch.source_triangles
     if source_triangles is not None:
@@ -261,7 +265,7 @@ def unfold(
         cells=numbers[cells],
         embedding=unfolding.embedding(patch.embedding),
         edges=edges,
-        inner_lines={},
+        inner_lines=inner_lines,
         # named points are those of copy 0, the sector
         points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
         representative=new_number[representative[used]] if is_glued else None,

@@ -118,3 +118,27 @@ def test_a_line_is_not_clamped_or_halved(tmp_path: Path) -> None:
     solid = from_file(tmp_path, {"over": "all", "pressure": 1}, model="solid", a_2="hinged")
     with pytest.raises(MeshError, match=r"boundary\.a_2: the surface has no such edge"):
         solid.problem().triangulated()
+
+
+def test_a_ring_within_a_sector() -> None:
+    """The whole shell of a sector, in which other modes are counted, has the line on all copies."""
+    tube = {"geometry": "cylinder", "radius": 1, "length": 0.5, "thickness": 0.05,
+            "youngs_modulus": 1e4, "poisson_ratio": 0.3}  # fmt: skip
+    lower, upper = (
+        {"shell": tube, "points": {"point": [1, 0, 0.25]}, **further}
+        for further in ({"boundary": {"bottom": "clamped"}}, {"place": {"position": [0, 0, 0.5]}})
+    )
+    load = {"edge": "upper.bottom", "per_length": [0, 0, -1e-3]}
+    scene = Scene(
+        Case.from_source({
+            "shells": {"lower": lower, "upper": upper},
+            "joints": [{"edges": ["lower.top", "upper.bottom"]}],
+            "loading": {"kind": "dead", "loads": [load], "factor": 1, "control": "load",
+                        "points": 1},
+            "mesh": {"refinement": 0.5, "degree": 3}, "reactions": True, "symmetry": 4,
+        })
+    )  # fmt: skip
+    *_, last = follow(scene)
+    observed = scene.observe(last.point.state)
+    assert observed["lower_bottom_fz"] == pytest.approx(2 * np.pi * 1e-3, rel=1e-4)
+    assert last.excluded_pivots == 0
