@@ -197,14 +197,16 @@ def components(state: StressState, point: StressPoint) -> dict[str, float]:
         for i, j in ((0, 0), (0, 1), (1, 1)):
             numbers[f"{symbol}{i + 1}{j + 1}{ending}"] = float(in_surface[i, j])
         if layer:
-            numbers[f"mises_{layer}"] = von_mises(in_surface)
+            numbers[f"mises_{layer}"] = float(von_mises(in_surface))
     Q1, Q2 = t @ state.shear
     return numbers | {"Q1": float(Q1), "Q2": float(Q2)}
 
 
-def von_mises(S: Array) -> float:
-    """Return von Mises' stress of plane stress S (2, 2)."""
-    return float(np.sqrt(S[0, 0] ** 2 + S[1, 1] ** 2 - S[0, 0] * S[1, 1] + 3 * S[0, 1] ** 2))
+def von_mises(S: Array) -> Array:
+    """Return von Mises' stress (...) of plane stress S, (..., 2, 2) or in space (..., 3, 3)."""
+    trace = np.einsum("...ii->...", S)
+    square = 1.5 * np.einsum("...ij,...ij->...", S, S) - 0.5 * trace**2
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 def directions(point: StressPoint, normal: Array, place: Array) -> Array:

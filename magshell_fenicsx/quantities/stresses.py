@@ -9,7 +9,7 @@ import re
 
 from magshell_fenicsx.quantities.quantity import Quantity, Unit
 
-LAYERS = ("top", "middle", "bottom")
+LAYERS = {"top": 1, "middle": 0, "bottom": -1}  # place of a layer: the outer face is the top
 MEMBRANE_FORCE = Unit("E h", "N/m", "N_per_m", "N/m", lambda g: g.E * g.h)
 BENDING_MOMENT = Unit("D/R", "N", "N", "N", lambda g: g.moment)
 SHEAR_FORCE = Unit("D/R²", "N/m", "N_per_m", "N/m", lambda g: g.moment / g.R)

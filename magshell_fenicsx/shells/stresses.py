@@ -22,9 +22,9 @@ from magshell_fenicsx.models.shell.strains import (
     membrane_force,
 )
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
+from magshell_fenicsx.quantities.stresses import LAYERS
 
 Array = NDArray[np.float64]
-LAYERS = {"top": 1, "middle": 0, "bottom": -1}  # place of a layer: the outer face is the top
 
 
 class Stresses:

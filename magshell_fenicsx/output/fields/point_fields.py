@@ -34,6 +34,7 @@ from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, pr
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
+from magshell_fenicsx.parts.stress import von_mises
 from magshell_fenicsx.quantities.stresses import LAYERS
 
 Array = NDArray[np.float64]
@@ -211,14 +212,8 @@ def mises_fields(fields: Mapping[str, Array]) -> dict[str, Array]:
 
     `fields` maps names such as "stress_top" to tensors of plane stress in space (..., 3, 3).
     """
-    mises = dict[str, Array]()
-    for layer in LAYERS:
-        S = fields.get(f"stress_{layer}")
-        if S is not None:
-            trace = np.einsum("...ii->...", S)
-            square = 1.5 * np.einsum("...ij,...ij->...", S, S) - 0.5 * trace**2
-            mises[f"mises_{layer}"] = np.sqrt(np.maximum(square, 0.0))
-    return mises
+    stresses = {layer: fields.get(f"stress_{layer}") for layer in LAYERS}
+    return {f"mises_{layer}": von_mises(S) for layer, S in stresses.items() if S is not None}
 
 
 def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
