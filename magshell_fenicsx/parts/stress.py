@@ -143,14 +143,14 @@ class StressPoints(Ability):
         from magshell_fenicsx.parts.loads import Loads  # the solver takes long to import
 
         shell, Q = context.shell, rotation(modelled.turn)
-        along = self._direction(context)
-        vectors = np.array([*([] if along is None else [along]), *np.eye(3)]) @ Q.T
+        direction = self._direction(context)
+        vectors = np.array([*([] if direction is None else [direction]), *np.eye(3)]) @ Q.T
         points = tuple(
             StressPoint(
                 name,
                 np.asarray(Q @ context.points[name] / shell.reference),
                 vectors,
-                has_meridian=along is None,
+                has_meridian=direction is None,
             )
             for name in self.names
         )

@@ -309,8 +309,8 @@ class ShellModel(ThinModel):
             if point.name not in self.midsurface.points:
                 from magshell_fenicsx.shells.stress_points import point_of_shell
 
-                at = point_of_shell(self, point)
-                self.observe_inside(point.name, at.cells, at.reference)
+                location = point_of_shell(self, point)
+                self.observe_inside(point.name, location.cells, location.reference)
 
     def _normals_at_points(self) -> dict[str, NDArray[np.float64]]:
         """Return the undeformed normals (3,) at the named points; collective."""

@@ -74,22 +74,24 @@ def shell_stresses(model: "ShellModel", point: StressPoint, mu: Mapping[str, flo
     MeshError
         On every rank, if the point is not on the surface, or where different parts of it meet.
     """
-    at = point_of_shell(model, point)
+    location = point_of_shell(model, point)
     samples, rule = basix.make_quadrature(basix.CellType.triangle, max(SAMPLE_DEGREE, model.degree))
-    frame, tensors = _sampled(model, at.cells, partial(_derivatives, at.cells), samples, mu)
+    frame, tensors = _sampled(
+        model, location.cells, partial(_derivatives, location.cells), samples, mu
+    )
     in_space = {name: frame.tensor(S).reshape(-1, 9) for name, S in tensors.items()}
     weights = frame.area * rule
     of_ranks = model.V.mesh.comm.allgather((frame.jet[0].reshape(-1, 3), weights.ravel(), in_space))
     places, weights = (np.concatenate([samples[i] for samples in of_ranks]) for i in (0, 1))
-    t = _frame_across(at.direction)
-    local_places = (places - at.place) @ t.T
+    t = _frame_across(location.direction)
+    local_places = (places - location.place) @ t.T
     values, gradients = dict[str, Array](), dict[str, Array]()
     for name in tensors:
         all_values = np.concatenate([samples[2][name] for samples in of_ranks])
         value, gradient = fit(local_places, weights, all_values, model.degree)
         values[name], gradients[name] = value.reshape(3, 3), gradient.reshape(-1, 3, 3)
     shear = np.einsum("ai,aij->j", t, gradients["M"])
-    return StressState(at.direction, at.place, values, shear)
+    return StressState(location.direction, location.place, values, shear)
 
 
 def meridian_stresses(
@@ -104,22 +106,22 @@ def meridian_stresses(
     MeshError
         Where different parts of the shell meet.
     """
-    at = point_of_meridian(model, point)
+    location = point_of_meridian(model, point)
     samples, rule = basix.make_quadrature(basix.CellType.interval, max(SAMPLE_DEGREE, model.degree))
 
     def jets(f: fem.Function, places: Array) -> Array:
         """Return the jets of a field at reference places of the cells, at azimuth 0."""
-        return revolved(_derivatives(at.cells, f, places))
+        return revolved(_derivatives(location.cells, f, places))
 
-    frame, tensors = _sampled(model, at.cells, jets, samples, mu)
-    (rho, z), (rho_s, z_s) = at.place, at.direction
-    along, place = np.array([rho_s, 0.0, z_s]), np.array([rho, 0.0, z])
-    local_places = ((frame.jet[0] - place) @ along).reshape(-1, 1)
+    frame, tensors = _sampled(model, location.cells, jets, samples, mu)
+    (rho, z), (rho_s, z_s) = location.place, location.direction
+    tangent, place = np.array([rho_s, 0.0, z_s]), np.array([rho, 0.0, z])
+    local_places = ((frame.jet[0] - place) @ tangent).reshape(-1, 1)
     weights = np.ravel(np.linalg.norm(frame.jet[1], axis=-1) * rule)
     # e_rho, e_theta and e_z at the azimuth of the point
     basis = rotation(float(np.arctan2(point.place[1], point.place[0])))
     normal = np.array([-z_s, 0.0, rho_s])
-    t = np.stack([along, np.cross(normal, along)]) @ basis
+    t = np.stack([tangent, np.cross(normal, tangent)]) @ basis
     values, shear = dict[str, Array](), 0.0
     for name, components in tensors.items():
         value, (slope,) = fit(local_places, weights, components.reshape(-1, 3), model.degree)
