@@ -155,6 +155,17 @@ def test_a_tank_at_its_foot(settings: list[str], h: float, error: float) -> None
     assert row["foot_mises_top_Pa"] == pytest.approx(mises, rel=error)
 
 
+def test_a_tank_of_concrete() -> None:
+    """The moment at the foot of a full tank, 20 904 N by Timoshenko's formula (art. 118)."""
+    wall = "{geometry: cylinder, radius: 10 m, length: 8 m, thickness: 0.1 m, "
+    material = "youngs_modulus: 30 GPa, poisson_ratio: 0.2}"
+    points = "{foot: [10 m, 0, 0], wall: [10 m, 0, 4 m]}"
+    pressure = "loading.loads=[{over: all, pressure: '-9810*(8 - z)'}]"
+    settings = [f"shell={wall}{material}", f"points={points}", pressure]
+    row = last_row(Case.load(CASES / "tank.yaml", settings))
+    assert row["foot_M11_N"] == pytest.approx(20_904, rel=1e-3)
+
+
 def test_a_point_of_a_half() -> None:
     """Half of a plate has what the whole plate has at a point, in the directions of the case."""
     case = {
