@@ -275,7 +275,7 @@ class ModelBase:
         MeshError
             On every rank, if they have no single value at a point.
         """
-        from magshell_fenicsx.shells.stress_points import (  # of few runs
+        from magshell_fenicsx.shells.stress_recovery import (  # of few runs
             meridian_stresses,
             shell_stresses,
         )

@@ -307,7 +307,7 @@ class ShellModel(ThinModel):
         """Observe points of stresses that are no vertices, as those of a mesh file; collective."""
         for point in self.loads.stress.points if self.loads.stress else ():
             if point.name not in self.midsurface.points:
-                from magshell_fenicsx.shells.stress_points import point_of_shell
+                from magshell_fenicsx.shells.stress_recovery import point_of_shell
 
                 location = point_of_shell(self, point)
                 self.observe_inside(point.name, location.cells, location.reference)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from mpi4py import MPI
 
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.bodies.contact_step import PRESSURE_MAX
 from magshell_fenicsx.quantities.registry import AMPLITUDES, amplitude
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes, mode_space
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -30,7 +31,6 @@ SAFETY = 1.25  # factor of the change by one degree more, for the error
 FURTHER_MODES = 2  # that are computed with one degree more, as their order may differ
 LATER = "limit_load_"  # before the number of an instability after the first
 LATER_TAKE_LONG = "this and later instabilities have no estimate, as it would take long"
-PRESSURE_MAX = "contact_pressure_max"  # column of path.csv, and the begin of others
 MOST_INSTABILITIES = 4  # of a path on a meridian, whose errors are estimated
 
 

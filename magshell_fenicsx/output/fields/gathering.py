@@ -46,7 +46,7 @@ from magshell_fenicsx.output.fields.surface import (
     resolved_pressure,
 )
 from magshell_fenicsx.shells.revolution import ENDS, Revolution
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -87,7 +87,7 @@ class RevolvedGatherer:
 
         `mu` has the amplitudes of growing imperfections. "At ends" means at both ends of each cell,
         where values are shown; "at samples" is where strains and moments are computed. `_fields`
-        computes fields of a displacement at ends, `_stresses` strains and moments at samples.
+        computes fields of a displacement at ends, `_resultants` strains and moments at samples.
         `_law` is the law of elasticity at ends, `_at_ends` has the tangent frames there, and
         `_constant` the fields that no displacement changes.
         """
@@ -109,10 +109,10 @@ class RevolvedGatherer:
             natural=loads.natural,
             made_of=made_of,
         )
-        self._stresses = Stresses(
+        self._resultants = StressResultants(
             r_at_samples, model.material, thickness_at_samples, loads.natural, made_of
         )
-        self._at_ends = Stresses(r, model.material, thickness_at_ends).frame
+        self._at_ends = StressResultants(r, model.material, thickness_at_ends).frame
         # imperfections and shell numbers are constant fields too
         if isinstance(model.meridian.embedding, DeviatedEmbedding):
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
@@ -171,9 +171,9 @@ class RevolvedGatherer:
         swept = self._swept
         # strains and moments are recovered from samples, other fields are computed at ends
         u_at_samples = swept.inner_jets(self._model.u, self._inner)
-        stresses = self._stresses.values_of(u_at_samples, state.mu)
+        stresses = self._resultants.values_of(u_at_samples, state.mu)
         if self._model.loads.stress:
-            stresses |= self._stresses.forces_of(u_at_samples, state.mu)
+            stresses |= self._resultants.forces_of(u_at_samples, state.mu)
         # by name, "E" and "M": components at the ends, and the jump of the samples
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}

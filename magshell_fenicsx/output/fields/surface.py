@@ -42,7 +42,7 @@ from magshell_fenicsx.output.fields.recovery import (
     split,
 )
 from magshell_fenicsx.shape.drawn_bodies import Solid
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -87,8 +87,8 @@ class Surface:
         drawn shape, where there is a natural shape. E_1, E_2, M_1, M_2: principal values of E and
         M, the larger first. w0_over_h: the imperfections, where there are some; a solid has no
         other field. Further names are those of `point_fields.PointFields`,
-        `point_fields.rubber_fields` and, where stresses are wanted, `Stresses.forces_of` and
-        `point_fields.mises_fields`.
+        `point_fields.rubber_fields` and, where stresses are wanted, `point_fields.mises_fields` and
+        `StressResultants.forces_of`.
     outlines
         Places (n, 3) along lines that outline the sources of the applied field, and bodies.
     jump
@@ -177,7 +177,7 @@ class SurfaceGatherer:
     ) -> None:
         """Set all that depends on the undeformed placement: fields, recovery, averages; collective.
 
-        `_fields` computes fields of a displacement at nodes, `_stresses` strains and moments at
+        `_fields` computes fields of a displacement at nodes, `_resultants` strains and moments at
         samples. `_to_space` maps components in tangent frames to components in space. `_constant`
         has the fields that no displacement changes. `_averaging_matrix` takes values at the nodes
         of all cells to means at the nodes of the surface. `_r0` and `_n0` are placement and unit
@@ -207,10 +207,10 @@ class SurfaceGatherer:
             natural=loads.natural,
             made_of=made_of,
         )
-        self._stresses = Stresses(
+        self._resultants = StressResultants(
             r_at_samples, model.material, thickness_at_samples, loads.natural, made_of
         )
-        self._to_space = components_in_space(self._stresses.frame)
+        self._to_space = components_in_space(self._resultants.frame)
         if numbers is not None:  # at the first call: which nodes cells share never changes
             self._split_nodes(numbers, r=r[0], r_at_samples=r_at_samples[0])
         self._averaging_matrix = self._weighted_mean()
@@ -249,7 +249,7 @@ class SurfaceGatherer:
         prescribed_fields = [
             self._gather_cells(field) for field in self._prescribed_fields(r) if field.size
         ]
-        sample_area = self._stresses.frame.area * self._sample_weights
+        sample_area = self._resultants.frame.area * self._sample_weights
         r, n0, samples, weight = (
             self._gather_cells(values) for values in (r, self._fields.n0, r_at_samples, sample_area)
         )
@@ -340,9 +340,9 @@ class SurfaceGatherer:
         u_at_nodes, law = self._averaged(jet[0]), self._law_at_nodes()
         # fields that are recovered from samples in cells: strains and moments
         u_at_samples = self._jet(self._model.u, self._reference_samples)
-        stresses = self._stresses.values_of(u_at_samples, state.mu)
+        stresses = self._resultants.values_of(u_at_samples, state.mu)
         if self._model.loads.stress:
-            stresses |= self._stresses.forces_of(u_at_samples, state.mu)
+            stresses |= self._resultants.forces_of(u_at_samples, state.mu)
         tensors = {
             name: self._gather_cells(np.einsum("...ia,...a->...i", self._to_space, S))
             for name, S in stresses.items()

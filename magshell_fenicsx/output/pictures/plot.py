@@ -55,13 +55,13 @@ from magshell_fenicsx.output.store.stored_results import (
     style_of,
 )
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
+from magshell_fenicsx.parts.bodies.contact_step import PRESSURE_MAX
 from magshell_fenicsx.parts.observables import MapGrid
 from magshell_fenicsx.quantities.registry import field_columns
 
 MAX_PANELS = 12  # of solutions.png
 MAPS = "field_maps"  # key of the case with the names of grids
 MAX_FRAMES = 40
-PRESSURE_MAX = "contact_pressure_max"  # column of path.csv
 
 
 class PicturedRun:

@@ -44,6 +44,7 @@ SMALLEST_STEP = 1e-9
 # matrices of a step along a contact, whose rim moves from point to point before it settles
 EASY_ITERATIONS, HARD_ITERATIONS = 4, 8
 FIRST_APPROACH = 0.1  # over h: the first step towards a force
+PRESSURE_MAX = "contact_pressure_max"  # column of path.csv, and the begin of others
 
 
 class ContactSection(PathStep):
@@ -214,7 +215,7 @@ class BodiesObservables(Observables):
             each=True,
         ),
         Quantity(
-            "contact_pressure_max",
+            PRESSURE_MAX,
             "largest contact pressure",
             "At the points of the quadrature; where the contact is narrower than a cell, as at an "
             "edge of the body, it depends on mesh and penalty.",

@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.point_fields import principal_fields
 from magshell_fenicsx.parts.natural.shape import Natural
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 STRIP = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0}
@@ -288,7 +288,7 @@ def test_fields_of_what_is_held() -> None:
     jet = np.zeros((6, 1, 4, 3))
     jet[1, ..., 0], jet[2, ..., 1] = 2.0, 0.5
     stretch, curvature, along = np.full(3, 0.2), np.array([0.4, 0.4, 0.0]), lambda r0, n0: 0 * r0
-    stresses = Stresses(jet, Material(0.3, 0.01), None, Natural(curvature, stretch, along))
+    stresses = StressResultants(jet, Material(0.3, 0.01), None, Natural(curvature, stretch, along))
     held = stresses.values_of(0 * jet, {"natural_stretch": 1.0, "natural_curvature": 0.0})
     found = principal_fields(held)
     assert found["E_1"] == pytest.approx((1 / 1.44 - 1) / 2)

@@ -18,7 +18,7 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.shape import Natural, meridians
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 
 ISOTROPIC = {"E2": 1.0, "nu12": 0.3, "G12": 1 / 2.6}
 ALIKE = laminate(ply(17, 1.0, 0.4, **ISOTROPIC), ply(-60, 1.0, **ISOTROPIC))
@@ -190,7 +190,7 @@ def test_moments_in_pictures() -> None:
     jet[1, ..., 1], jet[2, ..., 0] = 1.0, -1.0
     u, e, k = np.zeros((6, 1, 1, 3)), 1e-4, 1e-3
     u[2, ..., 0], u[5, ..., 2] = -e, k
-    found = Stresses(
+    found = StressResultants(
         jet, Material(0.3, 0.1, laminate=laminate(ply(0, 3.0), ply(90, 3.0))), None
     ).values_of(u, {})
     _, B, D = CROSS.matrices(1.0)

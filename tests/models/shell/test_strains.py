@@ -17,7 +17,7 @@ from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 from magshell_fenicsx.simulate.follow import follow
 
 NU, H = 0.3, 0.05
@@ -147,7 +147,7 @@ def test_moments_take_the_thickness_that_is_there() -> None:
     """D grows with its third power."""
     jet, u = RNG.standard_normal((2, 6, 4, 3, 3))
     fields = [
-        principal_fields(Stresses(jet, Material(NU, H), t).values_of(u, {}))
+        principal_fields(StressResultants(jet, Material(NU, H), t).values_of(u, {}))
         for t in (None, np.full((4, 3), 2.0))
     ]
     assert fields[1]["M_1"] == pytest.approx(8 * fields[0]["M_1"])

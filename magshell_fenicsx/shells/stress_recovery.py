@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.stress import StressPoint, StressState
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.shells.revolution import revolved
-from magshell_fenicsx.shells.stresses import Stresses
+from magshell_fenicsx.shells.stress_resultants import StressResultants
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.meridian import MeridianModel
@@ -290,7 +290,7 @@ def _sampled(
     thickness = None
     if model.thickness is not None:
         thickness = _derivatives(cells, model.thickness, samples)[0, ..., 0]
-    stresses = Stresses(
+    stresses = StressResultants(
         jets(model.r0, samples), model.material, thickness, model.loads.natural, of_cells
     )
     u = jets(model.u, samples)

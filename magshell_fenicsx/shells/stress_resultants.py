@@ -27,7 +27,7 @@ from magshell_fenicsx.quantities.stresses import LAYERS
 Array = NDArray[np.float64]
 
 
-class Stresses:
+class StressResultants:
     """Membrane strains, forces and moments at points (cells, points per cell) of a shell.
 
     Parameters
