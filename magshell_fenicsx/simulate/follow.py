@@ -111,7 +111,9 @@ def follow(
         ends_at_event = step.until in ("limit", "bifurcation") and run.is_at_event
         if step is not steps[-1] and ends_at_event:
             raise Stopped(
-                f"{run.place}ends at a {run.label}, from which the next step cannot start"
+                f"{run.place}ends at a {run.label}, from which the next step cannot start: with "
+                "then: snap it starts where the shell comes to rest, and with until: target this "
+                "one goes on"
             )
 
 
