@@ -45,12 +45,12 @@ see [howto.md](howto.md#let-the-editor-help).
 Any key can be given on the command line, `--set loading.points=40`, sections too: `--set
 "loading={kind: field}"`.
 
-**Units.** Dimensionless unless a unit stands in the table. On hemispheres, discs and strips a
-length, Young's modulus and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On
-all other geometries either all lengths and Young's modulus have units, and points, a profile, loads
-and mesh.size may have (without they are in m, N, N/m, Pa; a moment is per length, in N); or nothing
-has, and everything is in one's own units. A flux density has a unit everywhere. In a case with
-units, whatever its geometry, a point, a body or a magnet whose numbers have no unit is in metres.
+**Units.** Numbers are dimensionless unless a unit stands in the table. On hemispheres, discs and
+strips a length, Young's modulus and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`,
+`60 mT`. On all other geometries give all lengths and Young's modulus units, or none. Without units,
+use any consistent set. A flux density has a unit everywhere. In a case with units, whatever its
+geometry, a number without one is in SI: points, bodies, magnets, a profile and mesh.size in m,
+loads in N, N/m or Pa, a moment, which is per length, in N.
 """
 
 

@@ -88,9 +88,8 @@ class Step(Part):
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself
     (default), its conjugate displacement (of the pressure the volume, of a force the displacement),
-    or a gas under the shell. This step's own amplitude may stand here too if it has `until: limit`:
-    with `conjugate` the instability is that of a shell whose volume or displacement is held, not
-    its load"""
+    or a gas under the shell. With `until: limit` this step's own load may be named too: `conjugate`
+    then finds the instability at a prescribed volume or displacement"""
     search: SearchSection | None = None
     """Search for further solutions at the end of the step"""
 

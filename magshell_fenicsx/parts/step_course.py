@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
     Field(
-        description="Where the path ends. limit: at the first instability. Where that is a mode "
-        "which a half or a meridian excludes, the path goes on to the model's own first one, but "
-        "not beyond twice the load; the result is still the first. bifurcation: at the first "
-        "bifurcation; folds are passed. target: at the target. points: after `points` steps by "
+        description="Where the path ends. limit: at the first instability. If a half or a meridian "
+        "cannot show its mode, the path goes on to the first that it can show, at most to twice "
+        "the load; the result is still the first. bifurcation: at the first bifurcation; folds "
+        "are passed. target: at the target. points: after `points` steps by "
         "arc length. zero, with control: arc: where the load has risen and fallen back to zero, "
         "the top of an energy barrier, whose height is `barrier` in summary.json"
     ),

@@ -25,9 +25,9 @@ class ImperfectionStep(LoadStep):
     """An imperfection grows: the factor of its w0, from 0 (the shell without it) to 1 (as given)
     and beyond.
 
-    Displacements are measured from the shape without stress, which grows too; volumes from the
-    shape as drawn. Directions and areas of dead loads, thickness and remanence by formula are those
-    of the drawn shape. `until: target` ends at a factor.
+    Displacements count from the stress-free shape, which itself grows with the imperfection.
+    Volumes count from the drawn shape. Directions and areas of dead loads, thickness and remanence
+    by formula are those of the drawn shape too. `until: target` ends at a factor.
     """
 
     amplitude: ClassVar[str] = "imperfection"

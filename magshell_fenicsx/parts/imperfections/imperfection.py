@@ -292,8 +292,8 @@ class LocalSection(ImperfectionSection):
     amplitude: Annotated[float, number_over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
     width: Annotated[float, number_over("width")] = Field(ge=0.05, le=50)
-    """Half-width. A number is φo of a dimple, or φg of a Gaussian one, in radians times (√(12(1 -
-    ν²)) R/h)^(1/2); a length with a unit is R φo, or R φg"""
+    """Half-width. A length with a unit is R φo of a dimple, or R φg of a Gaussian one. A bare
+    number is that angle in radians times (12(1 - ν²))^(1/4) √(R/h)"""
     at: At = At.model_construct()
     """Its centre"""
 
