@@ -20,7 +20,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.mirror import Image, rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.polynomial_fit import polynomial_fits
 from magshell_fenicsx.models.shell.strains import TangentFrame
@@ -38,6 +38,7 @@ Numbers = NDArray[np.int64]
 Jets = Callable[[fem.Function, Array], Array]  # of a field at reference places of the cells
 SAMPLE_DEGREE = 6  # least degree of the quadrature rule whose points are samples
 NEWTON_STEPS = 12
+ON_PLANE = 1e-9  # over R: distance of a place from its mirror image where both are one
 SAME_DISTANCE = 1e-6  # over the size of a cell: cells that are as near to a point have it in common
 LARGEST_DISTANCE = 0.05  # of a point from the surface, over the size of a cell
 # difference between cells at a point, of unit normals (some 30 degrees), and relative of the
@@ -84,11 +85,16 @@ def shell_stresses(model: "ShellModel", point: StressPoint, mu: Mapping[str, flo
     of_ranks = model.V.mesh.comm.allgather((frame.jet[0].reshape(-1, 3), weights.ravel(), in_space))
     places, weights = (np.concatenate([samples[i] for samples in of_ranks]) for i in (0, 1))
     t = _frame_across(location.direction)
+    # a point on a mirror plane has cells on both sides of it
+    images = images_at(model, location.place)
+    places = np.concatenate([image.apply(places) for image in images])
     local_places = (places - location.place) @ t.T
+    weights = np.tile(weights, len(images))
     values, gradients = dict[str, Array](), dict[str, Array]()
     for name in tensors:
-        all_values = np.concatenate([samples[2][name] for samples in of_ranks])
-        value, gradient = fit(local_places, weights, all_values, model.degree)
+        S = np.concatenate([samples[2][name] for samples in of_ranks]).reshape(-1, 3, 3)
+        all_values = np.concatenate([image.Q @ S @ image.Q.T for image in images])
+        value, gradient = fit(local_places, weights, all_values.reshape(-1, 9), model.degree)
         values[name], gradients[name] = value.reshape(3, 3), gradient.reshape(-1, 3, 3)
     shear = np.einsum("ai,aij->j", t, gradients["M"])
     return StressState(location.direction, location.place, values, shear)
@@ -129,6 +135,12 @@ def meridian_stresses(
         if name == "M" and rho > AXIS:  # on the axis it is zero
             shear = float(slope[0] + (value[0] - value[2]) * rho_s / rho)
     return StressState(normal @ basis, place @ basis, values, shear * t[0])
+
+
+def images_at(model: "ShellModel", place: Array) -> list[Image]:
+    """Return the images of the modelled part that have a place (3,) over R; the part is first."""
+    images = model.mirror.images[: model.multiplicity]
+    return [image for image in images if np.allclose(image.apply(place), place, atol=ON_PLANE)]
 
 
 def point_of_shell(model: "ShellModel", point: StressPoint) -> PointInCells:
