@@ -18,6 +18,7 @@ from magshell_fenicsx.output.pictures.scales import numbers
 from magshell_fenicsx.output.pictures.sections import upright_section
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.shape.drawn_bodies import globe
 
 RISE = 0.4
 
@@ -89,6 +90,19 @@ def test_a_section_is_below_its_image_and_covers_no_text() -> None:
     assert min(text.get_fontsize() for text in texts) >= 8
     x, y = section.transData.transform([[0, 0], [1, 1]]).T
     assert np.ptp(x) == pytest.approx(np.ptp(y), rel=1e-6)
+
+
+def test_a_section_shows_what_the_shell_touches() -> None:
+    """A ball above the dent is a circle; one far above is not in its box."""
+    for height_of_ball, is_shown in ((0.5, True), (2.0, False)):
+        ball = replace(globe(0.3), points=globe(0.3).points + np.array([0, 0, height_of_ball]))
+        section = upright_section(replace(dome(-0.2), solids=(ball,)))
+        assert section
+        radii = np.linalg.norm(section.bodies - [0, height_of_ball - RISE / 2], axis=2)
+        assert radii == pytest.approx(0.3, abs=2e-3)
+        assert section.box[3] == pytest.approx(
+            height_of_ball + 0.3 - RISE / 2 if is_shown else RISE / 2, abs=0.02
+        )
 
 
 def test_a_displacement_that_is_not_seen_has_no_section() -> None:
