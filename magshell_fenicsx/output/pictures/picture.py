@@ -44,7 +44,7 @@ from magshell_fenicsx.output.pictures.layout import (
     panels_figure,
 )
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, RenderedSurface, Window
-from magshell_fenicsx.output.pictures.scales import Scale, colour_map, contour_values
+from magshell_fenicsx.output.pictures.scales import Scale, colour_map, contour_values, from_zero
 from magshell_fenicsx.output.pictures.sections import UprightSection, level_lines, upright_section
 from magshell_fenicsx.problem.requests import OutputSection
 
@@ -251,11 +251,14 @@ class Background:
         return places
 
     def contours(self, layer: ColouredField) -> list[tuple[Array, Pen]]:
-        """Return the visible lines (n, 2) on which a layer has round values, with their pen."""
+        """Return the visible lines (n, 2) on which a layer has round values, with their pen.
+
+        The values are those of a bar from the layer's least to its largest value and with zero.
+        """
         tessellation = tessellate(self._surface)
         places = tessellation.at_points(self._surface.r0 + self._surface.u)
         values = tessellation.at_points(layer.values)
-        low, high = layer.limits
+        low, high = from_zero(float(layer.values.min()), float(layer.values.max()))
         tolerance, contours = CONTOUR_TOLERANCE * (high - low), []
         for value in contour_values(low, high):
             lines = level_lines(tessellation.triangles, places, values - value, tolerance)
