@@ -8,11 +8,13 @@ from conftest import CASES
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.outlines import outlines
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.animation import _palette
 from magshell_fenicsx.output.pictures.bodies_and_magnets import far_bodies_note
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.colours import ColouredField, contact_region, moments
@@ -191,3 +193,20 @@ def test_contours_of_the_displacement() -> None:
     limits = (0.0, 5.0)
     *_, (line, _) = view.contours(ColouredField("w_over_h", w + noise, limits, "signed", ""))
     assert np.nanmin(np.linalg.norm(line, axis=1)) > 0.13  # a cell within its rim
+
+
+def test_an_animation_has_no_bands() -> None:
+    """Shades of red in shade, reduced to the palette of a GIF file: means over 8 by 8 pixels are
+    within 2.5 of 255 levels, and the colours of curves stay.
+    """
+    y, x = np.mgrid[0:1:240j, 0:1:320j][..., None]
+    shades = 255 * (1 - 0.5 * y) * (1 - x * [0.2, 0.8, 0.75])
+    frame = np.full((240, 400, 3), 255, np.uint8)
+    frame[:, :320] = np.rint(shades)
+    blue = (31, 119, 180)
+    frame[10:12, 340:380] = blue
+    palette = _palette([frame])
+    reduced = np.asarray(Image.fromarray(frame).quantize(palette=palette).convert("RGB"), float)
+    blocks = (reduced - frame).reshape(30, 8, 50, 8, 3).mean(axis=(1, 3))
+    assert np.abs(blocks[1:-1, 1:38]).max() < 2.5
+    assert np.abs(reduced[10:12, 340:380] - blue).max() <= 3
