@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import magshell_fenicsx.parts.registered  # noqa: F401
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.curve_additions import _section_image, _sections_of_strips
 from magshell_fenicsx.output.pictures.lines import CurveStep, curve_panels
 from magshell_fenicsx.output.pictures.mode_pictures import MODE_SIZE, mode_size
 from magshell_fenicsx.output.pictures.picture import figures
@@ -103,6 +104,22 @@ def test_a_section_shows_what_the_shell_touches() -> None:
         assert section.box[3] == pytest.approx(
             height_of_ball + 0.3 - RISE / 2 if is_shown else RISE / 2, abs=0.02
         )
+
+
+def test_shapes_of_strips_are_sections_by_one_plane() -> None:
+    """Those of a strip along a diagonal, also where it has not moved; a dome is drawn whole."""
+    turn = np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
+    moved = dome(-0.2, (0.5, 0.0))
+    strip = replace(moved, r0=moved.r0 * [1, 0.1, 1] @ turn.T)
+    at_rest = replace(strip, u=0 * strip.u)
+    first, last = _sections_of_strips([at_rest, strip])
+    assert first.direction == last.direction
+    assert first.deformed == pytest.approx(first.undeformed)
+    assert np.ptp(last.deformed[..., 1]) < np.ptp(first.deformed[..., 1])
+    image = _section_image(last, [first, last], (600.0, 400.0))
+    assert image[..., 3].max() == 255
+    assert image[0, 0, 3] == 0  # transparent beside the lines
+    assert _sections_of_strips([replace(moved, u=0 * moved.u), moved]) == []
 
 
 def test_a_displacement_that_is_not_seen_has_no_section() -> None:

@@ -35,6 +35,8 @@ class UprightSection:
     ----------
     undeformed, deformed, bodies
         (n, 2, 2) lines in the plane: to the right, and up along e3.
+    direction
+        Horizontal unit vector (x, y) in the plane.
     words
         Where the plane is.
     """
@@ -42,6 +44,7 @@ class UprightSection:
     undeformed: Array
     deformed: Array
     bodies: Array
+    direction: tuple[float, float]
     words: str
 
     @property
@@ -95,11 +98,10 @@ def upright_section(surface: Surface) -> UprightSection | None:
     distance, extent = float(np.linalg.norm(offset)), float((high - low).max())
     if distance > MIN_OFFSET * extent:
         x, y = offset / distance
-        sections = [_section(surface, middle, (x, y), "through the largest displacement")]
+        sections = [section_along(surface, (x, y), "through the largest displacement")]
     else:
         sections = [
-            _section(surface, middle, direction, f"along ${name}$")
-            for name, direction in DIRECTIONS
+            section_along(surface, direction, f"along ${name}$") for name, direction in DIRECTIONS
         ]
     long_sections = [
         section
@@ -120,11 +122,13 @@ def _height(section: UprightSection) -> float:
     return high - low
 
 
-def _section(
-    surface: Surface, middle: Array, direction: tuple[float, float], words: str
-) -> UprightSection:
-    """Return the section by the upright plane through a place along a horizontal unit vector."""
+def section_along(surface: Surface, direction: tuple[float, float], words: str) -> UprightSection:
+    """Return the section by the upright plane along a horizontal unit vector, through the middle.
+
+    The middle is that of the box around the undeformed surface. `words` say where the plane is.
+    """
     x, y = direction
+    middle = (surface.r0.min(axis=0) + surface.r0.max(axis=0)) / 2
     axes, normal = np.array([[x, y, 0.0], [0.0, 0.0, 1.0]]), np.array([-y, x, 0.0])
     lines_of_bodies = [
         level_lines(
@@ -140,7 +144,7 @@ def _section(
             np.concatenate([np.zeros((0, 2, 3)), *lines_of_bodies]),
         )
     )
-    return UprightSection(undeformed, deformed, bodies, words)
+    return UprightSection(undeformed, deformed, bodies, direction, words)
 
 
 def plane_section(surface: Surface, r: Array, place: Array, normal: Array) -> Array:

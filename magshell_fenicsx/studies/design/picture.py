@@ -274,9 +274,8 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     extent = float(np.ptp(places, axis=0).max())
     arrow_scale = ARROW * extent / longest
     right, vertical = arrow_scale * vectors[:, first], arrow_scale * vectors[:, second]
-    shown = np.arange(len(places))
-    if not line_style:
-        shown = spread_points(places, MIN_ARROW_DISTANCE * extent)
+    min_distance = 0.0 if line_style else MIN_ARROW_DISTANCE * extent
+    shown = spread_points(places, min_distance) if min_distance else slice(None)
     axes.quiver(
         horizontal[shown],
         up[shown],
