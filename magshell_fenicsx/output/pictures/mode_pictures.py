@@ -81,8 +81,6 @@ def small_panels(
     style: OutputSection,
     camera: Camera,
     note: str = "",
-    *,
-    with_contours: bool = False,
 ) -> "Figure":
     """Return a figure of small panels in one window, with captions and one colour bar.
 
@@ -94,8 +92,6 @@ def small_panels(
         For each panel: the deformed shell, its coloured field, and the text above it.
     note
         Text at the foot of the figure; empty for none.
-    with_contours
-        Whether each panel has lines at round values of its own field.
     """
     from matplotlib.figure import Figure
 
@@ -119,10 +115,7 @@ def small_panels(
     figure.text(*text_place, note, va="center", fontsize=style.font_size)
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
         # the window is given, so that the width of the picture does not count
-        view = Background(surface, camera, width=0, window=window)
-        panel = view.panel(layer, style)
-        if with_contours:
-            panel = replace(panel, lines=(*view.contours(layer), *panel.lines))
+        panel = Background(surface, camera, width=0, window=window).panel(layer, style)
         left, lower = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
         axes = boxes.axes(left + gap / 2, lower, cell_width - gap, image_height)
         draw_panel(axes, panel, style)
@@ -209,7 +202,7 @@ def solutions_figure(
         captions.append(f"{_name(row)}: {stable_or_unstable}\n{words}")
     with drawing(style):
         note = "Lines are at round values of each shell's own $w/h$."
-        return small_panels(surfaces, layers, captions, style, camera, note, with_contours=True)
+        return small_panels(surfaces, layers, captions, style, camera, note)
 
 
 def _name(row: Row) -> str:

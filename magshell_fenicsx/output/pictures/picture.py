@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 FIELDS_WITH_NAMES = ("", "w_over_h")  # names of fields whose pictures name the shells
+FIELDS_WITH_CONTOURS = ("w_over_h",)  # names of fields that have lines at round values
 PICTURES_WITH_BODIES = ("shell", "fields", "contact")  # the others show the shell alone
 GREY = 0.93  # of a surface without colours
 END_TOLERANCE = 0.01  # of a bar's length: values no farther beyond its ends are those of the ends
@@ -152,12 +153,7 @@ def figures(
         with drawing(style):
             panels = [view.panel(layer, style) for layer in content.layers]
             if name == "shell":
-                contours = view.contours(content.layers[0])
-                panels[0] = replace(
-                    panels[0],
-                    lines=(*contours, *panels[0].lines),
-                    section=visible_section(surface, view.window),
-                )
+                panels[0] = replace(panels[0], section=visible_section(surface, view.window))
             drawn_figures[name] = panels_figure(panels, style, content.note)
     return drawn_figures
 
@@ -290,13 +286,14 @@ class Background:
         slack = END_TOLERANCE * (high - low)
         is_below = bool(np.nanmin(layer.values) < low - slack)
         is_above = bool(np.nanmax(layer.values) > high + slack)
+        contours = self.contours(layer) if layer.name in FIELDS_WITH_CONTOURS else ()
         scale = Scale((low, high), layer.colours, layer.caption, (is_below, is_above))
         return Panel(
             self._with_bodies(image),
             self.window,
             self._camera,
             scale,
-            self._lines,
+            (*contours, *self._lines),
             texts=texts,
             names=names,
         )
