@@ -155,7 +155,7 @@ def telling(folder: Path) -> list[str]:
     if not (folder / "path.csv").exists():
         return []
     rows = read_rows(folder / "path.csv")
-    for name in ("field_maps.png", "sensors.png"):
+    for name in ("field_maps.png", "sensors.png", "frequencies.png"):
         if (folder / name).exists():
             return [name]
     if rows[-1]["amplitude"] == "time":
@@ -185,15 +185,15 @@ def _add_shapes(folder: Path) -> None:
 
 
 def _shrink(source: Path, target: Path) -> None:
-    """A picture of one column of a paper has WIDTH pixels, a wider one half as many more: its
-    letters stay legible.
+    """A picture of one column of a paper has WIDTH pixels, a wider one twice as many: its letters
+    stay as large.
     """
     with Image.open(source) as opened:
         wide, picture = (
             opened.width / opened.info.get("dpi", (200.0,))[0] > COLUMN,
             opened.convert("RGB"),
         )
-    picture.thumbnail((WIDTH * 3 // 2 if wide else WIDTH, 10 * WIDTH))
+    picture.thumbnail((2 * WIDTH if wide else WIDTH, 10 * WIDTH))
     picture.save(target, optimize=True)
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
+PANEL_WIDTH, PANEL_HEIGHT = 3.3, 2.9  # inches: three in a row keep text of 8 points on a page
 STYLES = ("-", "--", ":", "-.")
 LEGEND_ROWS = 16
 LEAST_MAPPED = 3  # different values of both axes of a map

@@ -8,16 +8,18 @@ from conftest import CASES
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.outlines import outlines
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.animation import _palette
 from magshell_fenicsx.output.pictures.bodies_and_magnets import far_bodies_note
 from magshell_fenicsx.output.pictures.captions import write_numbers
-from magshell_fenicsx.output.pictures.colours import contact_region, moments
+from magshell_fenicsx.output.pictures.colours import ColouredField, contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel, panels_figure
-from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.picture import Background, figures
 from magshell_fenicsx.output.pictures.rendering import (
     Camera,
     Window,
@@ -72,7 +74,7 @@ def test_a_source_is_drawn_whole_or_not_at_all() -> None:
     t = np.linspace(0, 2 * np.pi, 49)
     circle = np.column_stack([np.cos(t), np.sin(t), 0 * t])
     up = np.array([0.0, 0, 1])
-    near, far, ring = circle + 3 * up, circle + 5 * up, 0.5 * circle + 0.5 * up
+    near, far, ring = circle + 3 * up, circle + 6 * up, 0.5 * circle + 0.5 * up
     joining = np.linspace(near[12], far[12], 2)
     surface = grid(3)
     drawn = near_outlines(
@@ -84,7 +86,7 @@ def test_a_source_is_drawn_whole_or_not_at_all() -> None:
     assert [line is ring for line in drawn] == [True]
 
 
-@pytest.mark.parametrize(("farther", "drawn"), [(0.0, True), (1.0, False)])
+@pytest.mark.parametrize(("farther", "drawn"), [(0.0, True), (1.5, False)])
 def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
     """That of the case: drawn, with a camera for which the shell fills more of the picture than for
     the usual one.
@@ -153,3 +155,58 @@ def test_moments_that_are_noise_are_pale() -> None:
     )
     assert smooth == pytest.approx(np.abs(wave).max())
     assert noise > 10 * np.sqrt(np.mean(wave**2))
+
+
+def test_names_of_shells_cover_no_other_names() -> None:
+    """Two shells at one place, as a plate and its stiffener seen from above: the second name is a
+    line beside the first.
+    """
+    flat = grid(9)
+    numbers = np.repeat([0.0, 1.0], len(flat.r0))
+    r0 = np.concatenate([flat.r0, flat.r0])
+    cells = np.concatenate([flat.cells, flat.cells + len(flat.r0)])
+    n0 = np.tile([0.0, 0, 1], (len(r0), 1))
+    surface = Surface(r0, 0 * r0, n0, cells, {"shell": numbers}, shells=("plate", "stiffener"))
+    style = OutputSection()
+    figure = figures(surface, 0.01, style, ABOVE, ["shell"])["shell"]
+    texts = [text for axes in figure.axes for text in axes.texts]
+    first, second = (
+        next(text for text in texts if text.get_text() == name) for name in surface.shells
+    )
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    assert not first.get_window_extent(renderer).overlaps(second.get_window_extent(renderer))
+
+
+def test_contours_of_the_displacement() -> None:
+    """Circles at the round values between the limits, not at zero; a plateau at a round value has
+    no lines within.
+    """
+    surface = grid()
+    distance = np.linalg.norm(surface.r0, axis=1)
+    w = np.clip(5 * (1 - distance), 0, 4)
+    view = Background(surface, ABOVE, 300)
+    contours = view.contours(ColouredField("w_over_h", w, (0.0, 4.0), "signed", ""))
+    radii = [np.linalg.norm(line[~np.isnan(line[:, 0])], axis=1) for line, _ in contours]
+    assert [radius.mean() for radius in radii] == pytest.approx([0.8, 0.6, 0.4], abs=0.01)
+    # noise of rounding on the plateau
+    noise = 1e-9 * np.sin(1e3 * distance)
+    limits = (0.0, 5.0)
+    *_, (line, _) = view.contours(ColouredField("w_over_h", w + noise, limits, "signed", ""))
+    assert np.nanmin(np.linalg.norm(line, axis=1)) > 0.13  # a cell within its rim
+
+
+def test_an_animation_has_no_bands() -> None:
+    """Shades of red in shade, reduced to the palette of a GIF file: means over 8 by 8 pixels are
+    within 2.5 of 255 levels, and the colours of curves stay.
+    """
+    y, x = np.mgrid[0:1:240j, 0:1:320j][..., None]
+    shades = 255 * (1 - 0.5 * y) * (1 - x * [0.2, 0.8, 0.75])
+    frame = np.full((240, 400, 3), 255, np.uint8)
+    frame[:, :320] = np.rint(shades)
+    blue = (31, 119, 180)
+    frame[10:12, 340:380] = blue
+    palette = _palette([frame])
+    reduced = np.asarray(Image.fromarray(frame).quantize(palette=palette).convert("RGB"), float)
+    blocks = (reduced - frame).reshape(30, 8, 50, 8, 3).mean(axis=(1, 3))
+    assert np.abs(blocks[1:-1, 1:38]).max() < 2.5
+    assert np.abs(reduced[10:12, 340:380] - blue).max() <= 3

@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import magshell_fenicsx.parts.registered  # noqa: F401
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.curve_additions import _section_image, _sections_of_strips
 from magshell_fenicsx.output.pictures.lines import CurveStep, curve_panels
 from magshell_fenicsx.output.pictures.mode_pictures import MODE_SIZE, mode_size
 from magshell_fenicsx.output.pictures.picture import figures
@@ -18,6 +19,7 @@ from magshell_fenicsx.output.pictures.scales import numbers
 from magshell_fenicsx.output.pictures.sections import upright_section
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.shape.drawn_bodies import globe
 
 RISE = 0.4
 
@@ -89,6 +91,35 @@ def test_a_section_is_below_its_image_and_covers_no_text() -> None:
     assert min(text.get_fontsize() for text in texts) >= 8
     x, y = section.transData.transform([[0, 0], [1, 1]]).T
     assert np.ptp(x) == pytest.approx(np.ptp(y), rel=1e-6)
+
+
+def test_a_section_shows_what_the_shell_touches() -> None:
+    """A ball above the dent is a circle; one far above is not in its box."""
+    for height_of_ball, is_shown in ((0.5, True), (2.0, False)):
+        ball = replace(globe(0.3), points=globe(0.3).points + np.array([0, 0, height_of_ball]))
+        section = upright_section(replace(dome(-0.2), solids=(ball,)))
+        assert section
+        radii = np.linalg.norm(section.bodies - [0, height_of_ball - RISE / 2], axis=2)
+        assert radii == pytest.approx(0.3, abs=2e-3)
+        assert section.box[3] == pytest.approx(
+            height_of_ball + 0.3 - RISE / 2 if is_shown else RISE / 2, abs=0.02
+        )
+
+
+def test_shapes_of_strips_are_sections_by_one_plane() -> None:
+    """Those of a strip along a diagonal, also where it has not moved; a dome is drawn whole."""
+    turn = np.array([[1, -1, 0], [1, 1, 0], [0, 0, np.sqrt(2)]]) / np.sqrt(2)
+    moved = dome(-0.2, (0.5, 0.0))
+    strip = replace(moved, r0=moved.r0 * [1, 0.1, 1] @ turn.T)
+    at_rest = replace(strip, u=0 * strip.u)
+    first, last = _sections_of_strips([at_rest, strip])
+    assert first.direction == last.direction
+    assert first.deformed == pytest.approx(first.undeformed)
+    assert np.ptp(last.deformed[..., 1]) < np.ptp(first.deformed[..., 1])
+    image = _section_image(last, [first, last], (600.0, 400.0))
+    assert image[..., 3].max() == 255
+    assert image[0, 0, 3] == 0  # transparent beside the lines
+    assert _sections_of_strips([replace(moved, u=0 * moved.u), moved]) == []
 
 
 def test_a_displacement_that_is_not_seen_has_no_section() -> None:

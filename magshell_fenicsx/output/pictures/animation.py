@@ -43,7 +43,7 @@ DURATION_OF_LAST = 1500  # ms, of the last frame
 MIN_FRAME_DURATION = 80  # ms
 MAX_CURVES = 4  # above each other
 MIN_CURVE_HEIGHT = 230  # pixels of a curve with its labels
-COLOURS = 128  # half of the palette
+COLOURS = 256  # of the palette
 STYLE = OutputSection(dpi=120, font_size=9)
 WHITE = (255, 255, 255)
 FOOT = 34  # pixels below the shell
@@ -151,20 +151,16 @@ def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
 
 
 def _palette(frames: Sequence[Image]) -> "Pillow.Image":
-    """Return a palette of 2 `COLOURS` entries for all frames; the first entry is white.
-
-    Half of the entries cover all colours, half resolve the frequent ones.
-    """
+    """Return a palette of `COLOURS` entries for all frames; the first entry is white."""
     from PIL import Image as Pillow
 
-    # each colour of the frames once, so that rare colours count as much as frequent ones
-    colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
+    pixels = np.concatenate(frames).reshape(-1, 3)
+    coloured = Pillow.fromarray(pixels[(pixels < WHITE[0]).any(axis=1)][None])
+    # entries that cover all colours, each moved to the mean of the pixels that are nearest to it:
+    # where an entry is off the shades of a shell, dither shows bands
+    reduced = coloured.quantize(COLOURS - 1, Pillow.Quantize.MAXCOVERAGE, kmeans=1)
     palette = Pillow.new("P", (1, 1))
-    methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
-    levels = list[int]()  # red, green and blue of each entry, one after the other
-    for method in methods:
-        levels += colours.quantize(COLOURS, method).getpalette() or []
-    palette.putpalette([*WHITE, *levels[3:]])  # white in place of the first entry
+    palette.putpalette([*WHITE, *(reduced.getpalette() or [])[: 3 * (COLOURS - 1)]])
     return palette
 
 

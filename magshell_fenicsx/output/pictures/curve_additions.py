@@ -29,7 +29,18 @@ from magshell_fenicsx.output.pictures.lines import (
 )
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
-from magshell_fenicsx.output.pictures.scales import SIGNED, from_zero, number_format, numbers
+from magshell_fenicsx.output.pictures.scales import (
+    SIGNED,
+    from_zero,
+    number_format,
+    numbers,
+    pixel_canvas,
+)
+from magshell_fenicsx.output.pictures.sections import (
+    UprightSection,
+    section_along,
+    upright_section,
+)
 from magshell_fenicsx.output.store.stored_results import case_in, pole_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
@@ -47,6 +58,8 @@ PLACES_PER_SIDE = 9  # that are tried for a shell
 MARGIN = 0.02  # around these places, over the axes
 # costs of covering all of the curve, and another shell; a distance of one width of the axes costs 1
 COST_OF_CURVE, COST_OF_SHELL = 12.0, 50.0
+NARROW = 0.25  # width over length of a shell, seen from above, of which sections are drawn
+TINY = 1e-300  # least divisor
 OPAQUE = 127  # of 255: pixels with a larger opacity belong to a shell
 
 
@@ -193,8 +206,9 @@ def add_shapes(
 ) -> None:
     """Draw the shell at some points on the curves of a figure, with a line from each to its point.
 
-    Each shell is where it covers least. All are of one scale, coloured by their own w/h. The title
-    has the range of colours, and the factor of displacements that are too small to be seen.
+    Each shell is where it covers least. All are of one scale, coloured by their own w/h; of shells
+    whose pictures would be blades the sections are drawn. The title has the range of colours, and
+    the factor of displacements that are too small to be seen.
 
     Parameters
     ----------
@@ -221,21 +235,24 @@ def add_shapes(
     texts, _ = numbers([*limits])
     colours = [f"{text} {colour}" for text, colour in zip(texts, ("blue", "red"), strict=True)]
     words = f"shapes: $w/h$ = 0 white, {', '.join(text for text in colours if text[:2] != '0 ')}"
+    places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
+    sections = _sections_of_strips(magnified)
+    words = "shapes: sections; grey: undeformed" if sections else words
     words += f"\ndisplacements of shapes $\\times$ {factor:g}" if factor > 1 else ""
     for panel_number in dict.fromkeys(i for i in panel_numbers if i is not None):
         axes = figure.axes[panel_number]
         axes.set_title("\n".join(text for text in (axes.get_title(), words) if text))
     place_axes(figure)  # shapes are drawn to the sizes of the axes
-    places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
     occupied = dict[int, list[Array]]()  # number of a panel -> boxes of the shapes drawn so far
-    for number, (row, _), surface, field in zip(
-        panel_numbers, shapes, magnified, fields, strict=True
-    ):
+    for i, (number, (row, _)) in enumerate(zip(panel_numbers, shapes, strict=True)):
         if number is None:
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
-        image = _shell_image(surface, field, camera, places, (box.width, box.height))
+        if sections:
+            image = _section_image(sections[i], sections, (box.width, box.height))
+        else:
+            image = _shell_image(magnified[i], fields[i], camera, places, (box.width, box.height))
         # its place near the point of the curve, where other shapes are not
         size_over_axes = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         point = np.array(curve_coordinates(row, panels[number][0].amplitude))
@@ -244,6 +261,46 @@ def add_shapes(
         _add_shape(axes, image, point, corner, size_over_axes)
         if row["label"] not in LOCATED:  # those have marks
             axes.plot(*point, "o", color="k", markersize=MARK_SIZE, zorder=5)
+
+
+def _sections_of_strips(surfaces: Sequence[Surface]) -> list[UprightSection]:
+    """Return sections by one plane of narrow shells, whose pictures would be blades.
+
+    The list is empty for other shells. The surfaces are those of one shell, of which the one that
+    moves most tells the plane.
+    """
+    spread = np.linalg.svd(np.cov(surfaces[0].r0[:, :2].T), compute_uv=False)  # squares of lengths
+    if spread[1] > NARROW**2 * spread[0]:
+        return []
+    section = upright_section(max(surfaces, key=lambda surface: float(np.abs(surface.u).max())))
+    if section is None:
+        return []
+    return [section_along(surface, section.direction, section.words) for surface in surfaces]
+
+
+def _section_image(
+    section: UprightSection, sections: Sequence[UprightSection], axes_size: tuple[float, float]
+) -> Image:
+    """Return the image of a section, on the scale of several, in the room that axes have for it.
+
+    `axes_size` is width and height of the axes in pixels.
+    """
+    from matplotlib.figure import Figure
+
+    boxes = np.array([each.box for each in sections])
+    left, low = boxes[:, [0, 2]].min(axis=0)
+    right, high = boxes[:, [1, 3]].max(axis=0)
+    room = MAX_WIDTH * axes_size[0], MAX_HEIGHT * axes_size[1]
+    scale = min(room[0] / (right - left), room[1] / max(high - low, TINY))
+    width, height = (max(scale * size, 8.0) for size in (right - left, high - low))
+    figure = Figure(figsize=(width / STYLE.dpi, height / STYLE.dpi), dpi=STYLE.dpi)
+    figure.patch.set_alpha(0.0)
+    axes = figure.add_axes((0.02, 0.02, 0.96, 0.96))
+    section.draw(axes)
+    axes.set(xlim=(left, right), ylim=(low, high))
+    canvas = pixel_canvas(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())
 
 
 def _shell_image(

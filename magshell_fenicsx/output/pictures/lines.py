@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 SEGMENTS_PER_INTERVAL = 16  # drawn between two points
 MAX_SLOPE_RATIO = 3.0  # slope of a curve at a point over the lesser one of the chords there
 MIN_CHORD = 1e-12  # scaled; a shorter one counts as this
+# power of a chord by which the parameter of a smooth curve grows. With 0.7 to 0.9 the curves of 41
+# cases through every second or third of their points are nearest to the points left out; with 0.5
+# the two ways along a loop part between its points
+CHORD_EXPONENT = 0.8
 
 
 @dataclass(frozen=True)
@@ -247,7 +251,7 @@ class Line:
     def parameter(self, x: Sequence[float], y: Sequence[float]) -> Array:
         """Return the parameter (n,) of the smooth curve at the line's n rows, which ascends.
 
-        It is the time of a motion, and else the root of the chord in the axes x and y.
+        It is the time of a motion, and else that of `chord_parameter` in the axes x and y.
 
         Parameters
         ----------
@@ -368,10 +372,10 @@ def smooth(x: Sequence[float], y: Sequence[float], located: Sequence[bool] = ())
 
 
 def chord_parameter(x: Sequence[float], y: Sequence[float]) -> Array:
-    """Return the parameter (n,) of a smooth curve through n points: the root of the chord.
+    """Return the parameter (n,) of a smooth curve through n points, a power of the chords added up.
 
-    It grows between two points by the root of their distance in a picture, in which both axes count
-    equally.
+    It grows between two points by the power `CHORD_EXPONENT` of their distance in a picture, in
+    which both axes count equally.
 
     Parameters
     ----------
@@ -381,7 +385,7 @@ def chord_parameter(x: Sequence[float], y: Sequence[float]) -> Array:
     xy = np.array([x, y], float)
     scale = np.ptp(xy, axis=1)
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
-    return np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, MIN_CHORD)))])
+    return np.concatenate([[0], np.cumsum(np.maximum(steps, MIN_CHORD) ** CHORD_EXPONENT)])
 
 
 def limited_slopes(
@@ -389,9 +393,10 @@ def limited_slopes(
 ) -> Array:
     """Return the derivatives (n,) of values at n points by a parameter, for a smooth curve.
 
-    They are those of parabolas through three points, limited so that the curve rises wherever the
-    points rise (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). A coordinate that turns
-    between two points turns smoothly there. One that turns at a located point turns exactly at it.
+    They are those of the cubic spline, and at both ends of parabolas through three points. They are
+    limited so that the curve rises wherever the points rise (Fritsch and Carlson, SIAM J. Numer.
+    Anal. 17, 1980). A coordinate that turns between two points turns smoothly there. One that turns
+    at a located point turns exactly at it.
 
     Parameters
     ----------
@@ -413,17 +418,23 @@ def limited_slopes(
     limits = MAX_SLOPE_RATIO * np.abs(chords)
     limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf
     max_slopes = np.minimum(limits[:-1], limits[1:])
-    # slope of the parabola through three points, within the limits
-    inner_slopes = np.clip(
-        (h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes
-    )
-    # the coordinate turns exactly at a fold or bifurcation
-    is_located = np.array(located, bool) if len(located) else np.zeros(len(parameter), bool)
-    inner_slopes[is_located[1:-1] & (chords_before * chords_after < 0)] = 0.0
     ends = [
         _end_slope(h[0], h[1], chords[0], chords[1]),
         _end_slope(h[-1], h[-2], chords[-1], chords[-2]),
     ]
+    # the spline's curvature is the same on both sides of each inner point:
+    # h2 slope before + 2 (h1 + h2) slope + h1 slope after = 3 (h2 chord before + h1 chord after)
+    right_side = 3 * (h2 * chords_before + h1 * chords_after)
+    right_side[0] -= h2[0] * ends[0]
+    right_side[-1] -= h1[-1] * ends[1]
+    bands = np.zeros((3, len(h1)))
+    bands[0, 1:], bands[1], bands[2, :-1] = h1[:-1], 2 * (h1 + h2), h2[1:]
+    inner_slopes = np.clip(
+        scipy.linalg.solve_banded((1, 1), bands, right_side), -max_slopes, max_slopes
+    )
+    # the coordinate turns exactly at a fold or bifurcation
+    is_located = np.array(located, bool) if len(located) else np.zeros(len(parameter), bool)
+    inner_slopes[is_located[1:-1] & (chords_before * chords_after < 0)] = 0.0
     return np.concatenate([ends[:1], inner_slopes, ends[1:]])
 
 

@@ -61,6 +61,7 @@ DEPTH_TOLERANCE = 0.03  # over the shell's extent: depth at which places of arro
 ZERO_LOAD = 1e-4
 # over the largest displacements: distance of instabilities that are the same one
 SAME_INSTABILITY_TOLERANCE = 5e-3
+ALIKE = 0.04  # over the largest displacement: distance of solutions that look alike
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -187,13 +188,21 @@ def solutions_figure(
         for surface in surfaces
     ]
     captions = list[str]()
-    for row, surface in zip(rows, surfaces, strict=True):
+    for number, (row, surface) in enumerate(zip(rows, surfaces, strict=True)):
         stable_or_unstable, *_ = stability(row).split()  # the first word
         largest = float(surface.w[np.abs(surface.w).argmax()]) / h
         words = f"largest $w/h$ = {in_mathematics(largest, 4)}"
+        # an earlier shell from which this one can hardly be told in a picture
+        for earlier_row, earlier in zip(rows[:number], surfaces[:number], strict=True):
+            distance = float(np.linalg.norm(surface.u - earlier.u, axis=1).max()) / h
+            if distance < ALIKE * abs(largest):
+                words = (
+                    f"{words}\nat most {in_mathematics(distance, 2)} $h$ from {_name(earlier_row)}"
+                )
         captions.append(f"{_name(row)}: {stable_or_unstable}\n{words}")
     with drawing(style):
-        return small_panels(surfaces, layers, captions, style, camera)
+        note = "Lines are at round values of each shell's own $w/h$."
+        return small_panels(surfaces, layers, captions, style, camera, note)
 
 
 def _name(row: Row) -> str:

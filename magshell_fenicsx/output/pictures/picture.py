@@ -37,14 +37,15 @@ from magshell_fenicsx.output.pictures.colours import (
 from magshell_fenicsx.output.pictures.layout import (
     Arrow,
     Panel,
+    Pen,
     columns,
     drawing,
     panel_width,
     panels_figure,
 )
 from magshell_fenicsx.output.pictures.rendering import Camera, Image, RenderedSurface, Window
-from magshell_fenicsx.output.pictures.scales import Scale, colour_map
-from magshell_fenicsx.output.pictures.sections import UprightSection, upright_section
+from magshell_fenicsx.output.pictures.scales import Scale, colour_map, contour_values, from_zero
+from magshell_fenicsx.output.pictures.sections import UprightSection, level_lines, upright_section
 from magshell_fenicsx.problem.requests import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
@@ -52,12 +53,15 @@ if TYPE_CHECKING:  # takes long to import
 
 Array = NDArray[np.float64]
 FIELDS_WITH_NAMES = ("", "w_over_h")  # names of fields whose pictures name the shells
+FIELDS_WITH_CONTOURS = ("w_over_h",)  # names of fields that have lines at round values
 PICTURES_WITH_BODIES = ("shell", "fields", "contact")  # the others show the shell alone
 GREY = 0.93  # of a surface without colours
 END_TOLERANCE = 0.01  # of a bar's length: values no farther beyond its ends are those of the ends
 UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
 MIN_OUTLINE_DISTANCE = 2.0  # pixels, of the drawn undeformed outline from the deformed one
 MIN_OUTLINE_LENGTH = 40.0  # pixels, of drawn parts of the undeformed outline
+NAME_LETTER_WIDTH, NAME_HEIGHT = 0.7, 1.4  # of the font: room for names of shells
+CONTOUR_TOLERANCE = 1e-6  # over the range of colours: smaller differences come from rounding
 SAME_PLACE_TOLERANCE = 1e-7  # over R
 DEPTH_TOLERANCE = 2.0  # pixels: depth below the surface at which lines are visible
 ARROW_DEPTH_TOLERANCE = 0.03  # over the shell's extent, at which places of arrows are visible
@@ -242,13 +246,29 @@ class Background:
         places[~is_visible] = np.nan
         return places
 
+    def contours(self, layer: ColouredField) -> list[tuple[Array, Pen]]:
+        """Return the visible lines (n, 2) on which a layer has round values, with their pen.
+
+        The values are those of a bar from the layer's least to its largest value and with zero.
+        """
+        tessellation = tessellate(self._surface)
+        places = tessellation.at_points(self._surface.r0 + self._surface.u)
+        values = tessellation.at_points(layer.values)
+        low, high = from_zero(float(layer.values.min()), float(layer.values.max()))
+        tolerance, contours = CONTOUR_TOLERANCE * (high - low), []
+        for value in contour_values(low, high):
+            lines = level_lines(tessellation.triangles, places, values - value, tolerance)
+            interrupted = np.concatenate([lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
+            contours.append((self._visible_part(interrupted.reshape(-1, 3)), EDGE))
+        return contours
+
     def panel(self, layer: ColouredField, style: OutputSection) -> Panel:
         """Return the shell in a layer's colours, or grey with arrows if the layer has none.
 
         The limits of colours are those of the layer, or those that `style` gives for its field.
         """
         texts = tuple(self._bodies.poles)
-        names = self._names() if layer.name in FIELDS_WITH_NAMES else ()
+        names = self._names(style) if layer.name in FIELDS_WITH_NAMES else ()
         if not layer.colours:
             return Panel(
                 self.grey_image(GREY),
@@ -266,33 +286,44 @@ class Background:
         slack = END_TOLERANCE * (high - low)
         is_below = bool(np.nanmin(layer.values) < low - slack)
         is_above = bool(np.nanmax(layer.values) > high + slack)
+        contours = self.contours(layer) if layer.name in FIELDS_WITH_CONTOURS else ()
         scale = Scale((low, high), layer.colours, layer.caption, (is_below, is_above))
         return Panel(
             self._with_bodies(image),
             self.window,
             self._camera,
             scale,
-            self._lines,
+            (*contours, *self._lines),
             texts=texts,
             names=names,
         )
 
-    def _names(self) -> tuple[tuple[float, float, str], ...]:
+    def _names(self, style: OutputSection) -> tuple[tuple[float, float, str], ...]:
         """Return (x, y, name) of each of several shells that is visible, in the projection.
 
-        The place is the node nearest to the middle of the visible part.
+        The place is the node nearest to the middle of the visible part at which the name covers no
+        earlier one; the nearest node of all if there is no such one.
         """
         r, shell_numbers = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
         if shell_numbers is None:
             return ()
-        is_visible, names = self.seen.shows(r, DEPTH_TOLERANCE / self.window.scale), []
+        letter = style.font_size / 72 * style.dpi / self.window.scale  # its height over R
+        is_visible = self.seen.shows(r, DEPTH_TOLERANCE / self.window.scale)
+        names = list[tuple[float, float, str]]()
         for i, name in enumerate(self._surface.shells):
             is_of_shell = np.rint(shell_numbers) == i
             places = self._camera(r[is_visible & is_of_shell])[:, :2]
-            if len(places):
-                distances = np.linalg.norm(places - places.mean(axis=0), axis=1)
-                x, y = places[distances.argmin()]
-                names.append((float(x), float(y), name))
+            if not len(places):
+                continue
+            is_free = np.ones(len(places), bool)
+            for x, y, other_name in names:
+                offset_x, offset_y = np.abs(places - [x, y]).T
+                width = NAME_LETTER_WIDTH * letter * (len(name) + len(other_name)) / 2
+                is_free &= (offset_x > width) | (offset_y > NAME_HEIGHT * letter)
+            distances = np.linalg.norm(places - places.mean(axis=0), axis=1)
+            distances[~is_free] += np.inf if is_free.any() else 0.0
+            x, y = places[distances.argmin()]
+            names.append((float(x), float(y), name))
         return tuple(names)
 
     def grey_image(self, grey: float) -> Image:

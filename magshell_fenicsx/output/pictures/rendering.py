@@ -39,7 +39,7 @@ FUNCTIONS = """
 """
 FINER = 2  # drawn pixels along each side of a pixel of the picture
 LAMP = (-0.45, 0.55, 0.7)  # direction to the lamp: to the right, up, towards the eye
-RELIEF = 0.5  # of the light comes from the lamp, and falls on slopes alone
+RELIEF = 0.6  # of the light comes from the lamp, and falls on slopes alone
 RIM = 0.12  # loss of light where the surface is seen edgewise
 NEIGHBOURS = (-2, -1, 0, 1, 2)  # drawn pixels around one, along each side
 WINDOW_MARGIN = 0.02  # around what is drawn, over its largest side
@@ -385,7 +385,7 @@ def has_snapped(surface: Surface) -> bool:
 LARGEST_FRACTION = 0.999  # of the largest displacement: larger ones count as the largest
 NO_VALUE = 0.86  # grey of nan
 MIN_WHITE = 60  # brightness of 255 of what is white in any light
-MAX_DISTANCE = 2.5  # of drawn sources from the shell's middle, over the shell's extent
+MAX_DISTANCE = 2.8  # of drawn sources from the shell's middle, over the shell's extent
 MEETING_TOLERANCE = 1e-3  # over that distance: lines as near as this meet
 
 
@@ -394,8 +394,7 @@ def near_outlines(surface: Surface) -> tuple[Array, ...]:
 
     If one line of a source or body is too far, all of its lines are left out.
     """
-    r = surface.r0 + surface.u
-    middle, reach = r.mean(axis=0), MAX_DISTANCE * float(np.ptp(r, axis=0).max())
+    middle, reach = _middle_and_reach(surface)
     numbers = _object_numbers(surface.outlines, MEETING_TOLERANCE * reach)
     far_numbers = {
         number
@@ -411,9 +410,18 @@ def near_outlines(surface: Surface) -> tuple[Array, ...]:
 
 def near_solids(surface: Surface) -> tuple[Solid, ...]:
     """Return the faces of sources and bodies that are near enough to be drawn."""
-    r = surface.r0 + surface.u
-    middle, reach = r.mean(axis=0), MAX_DISTANCE * float(np.ptp(r, axis=0).max())
+    middle, reach = _middle_and_reach(surface)
     return tuple(solid for solid in surface.solids if _farthest(solid.points, middle) <= reach)
+
+
+def _middle_and_reach(surface: Surface) -> tuple[Array, float]:
+    """Return the middle (3,) of a deformed shell, and the distance of what is near to it.
+
+    The extent of the shell is that of its deformed or undeformed places, whichever is larger.
+    """
+    r = surface.r0 + surface.u
+    extent = max(float(np.ptp(places, axis=0).max()) for places in (surface.r0, r))
+    return r.mean(axis=0), MAX_DISTANCE * extent
 
 
 def _farthest(line: Array, middle: Array) -> float:

@@ -113,6 +113,20 @@ def round_limits(low: float, high: float) -> tuple[float, float]:
     return float(ticks[0]), float(ticks[-1])
 
 
+def contour_values(low: float, high: float) -> list[float]:
+    """Return the values of contours between two limits: steps of the bar's ticks, without zero.
+
+    Examples
+    --------
+    >>> contour_values(-1.4, 20.0), contour_values(-0.2, 0.0)
+    ([5.0, 10.0, 15.0], [-0.15, -0.1, -0.05])
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    ticks = MaxNLocator(MAX_INTERVALS, steps=STEPS).tick_values(low, high)
+    return [float(tick) for tick in ticks if low < tick < high and tick != 0]
+
+
 def colour_bar(
     figure: "Figure",
     axes: "Axes",

@@ -16,13 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.vtu import read_point
-from magshell_fenicsx.output.pictures.picture import edge_lines
+from magshell_fenicsx.output.pictures.picture import edge_lines, spread_points
 from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.quantities.registry import amplitude, endings, quantity
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS
 from magshell_fenicsx.studies.design.blocks import ControlPointField
 from magshell_fenicsx.studies.design.variables import Variables
-from magshell_fenicsx.studies.figures import add_legend, lengths_along_line, saved_figure
+from magshell_fenicsx.studies.figures import (
+    PANEL_HEIGHT,
+    PANEL_WIDTH,
+    add_legend,
+    lengths_along_line,
+    saved_figure,
+)
 from magshell_fenicsx.studies.naming import result_words, split_unit
 
 Array = NDArray[np.float64]
@@ -33,6 +39,8 @@ TITLES = {
     "deviation": "deviation $w_0/h$",
 }
 ARROW = 0.12  # the longest vector over the shell's extent
+MIN_ARROW_DISTANCE = 0.07  # over the shell's extent, of the feet of arrows
+HISTORY_STYLES = ("-", (0, (4, 2)), (0, (2, 2)), (0, (1, 2)))  # of the lines of several results
 IN_PLANE = 1e-6  # over R
 MARGINS = (-0.03, 0.03)  # beyond the bounds
 
@@ -122,7 +130,8 @@ def draw_design(
         + (vary.controls is not None)
         + len(vary.fields)
     )
-    with saved_figure(file, 4.0 * panels, max(3.6, 2.1 * len(units)), dpi=160) as figure:
+    height = max(PANEL_HEIGHT, 1.7 * len(units))
+    with saved_figure(file, PANEL_WIDTH * panels, height, dpi=160) as figure:
         grid = figure.add_gridspec(len(units), panels)
         previous_axes: Any = None
         for i, unit in enumerate(units):
@@ -177,8 +186,8 @@ def _draw_history(
         values = np.array(
             [np.nan if row[result] is None else row[result] for row in rows], dtype=float
         )
-        # the first lines are wider, so that lines that lie on each other are all seen
-        colour, line_width = f"C{i}", 1.2 + 0.8 * min(len(results) - 1 - i, 3)
+        # the first line is solid and wider, so that lines that lie on each other are all seen
+        colour, line_style = f"C{i}", HISTORY_STYLES[i % len(HISTORY_STYLES)]
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
         # the line of the best goes on to the last evaluation
         evaluation_numbers = np.append(number[best], number[-1:] if best.any() else [])
@@ -186,10 +195,10 @@ def _draw_history(
         axes.plot(
             evaluation_numbers,
             best_values,
-            "-",
+            linestyle=line_style,
             drawstyle="steps-post",
             color=colour,
-            linewidth=line_width,
+            linewidth=1.2 if i or len(results) == 1 else 2.0,
             label=result_words(result),
         )
         if result in target_values:
@@ -259,15 +268,19 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     axes.plot(horizontal, up, line_style + ".", color="0.6", markersize=3, linewidth=1)
     if shape is not None and not vary.controls.is_axisymmetric:
         axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
-    # arrows as long as a part of the shell's extent, drawn in the units of the places
+    # arrows as long as a part of the shell's extent, drawn in the units of the places. Where points
+    # are dense, on a surface, some have no arrow
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
-    arrow_scale = ARROW * float(np.ptp(places, axis=0).max()) / longest
+    extent = float(np.ptp(places, axis=0).max())
+    arrow_scale = ARROW * extent / longest
     right, vertical = arrow_scale * vectors[:, first], arrow_scale * vectors[:, second]
+    min_distance = 0.0 if line_style else MIN_ARROW_DISTANCE * extent
+    shown = spread_points(places, min_distance) if min_distance else slice(None)
     axes.quiver(
-        horizontal,
-        up,
-        right,
-        vertical,
+        horizontal[shown],
+        up[shown],
+        right[shown],
+        vertical[shown],
         color="C3",
         width=0.006,
         angles="xy",

@@ -21,7 +21,7 @@ from magshell_fenicsx.studies.ensemble.statistics import (
     fit,
     results,
 )
-from magshell_fenicsx.studies.figures import add_legend, saved_figure
+from magshell_fenicsx.studies.figures import PANEL_HEIGHT, PANEL_WIDTH, add_legend, saved_figure
 from magshell_fenicsx.studies.naming import result_label
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     # marks of few samples alone need no panel
     with_density = weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
     panels = 1 + with_density + (strongest is not None)
-    with saved_figure(file, 4.2 * panels, 3.6, dpi=160) as figure:
+    with saved_figure(file, PANEL_WIDTH * panels, PANEL_HEIGHT, dpi=160) as figure:
         # axes of the density (one or none), of the distribution function, and of the correlation
         *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]
         further_axes = figure.axes[1 + with_density :]
@@ -155,9 +155,9 @@ def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> N
     # the probability of so strong a correlation by chance
     probability_text = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
     number = f"{rho:.2f}".replace("-", "−")
-    axes.set(xlabel=words(key), ylabel=label)
+    axes.set(xlabel=words(key).replace(" of the", "\nof the"), ylabel=label)
     axes.set_title(
-        f"Spearman's correlation {number}, $n$ = {len(pairs)}, {probability_text}", fontsize=9
+        f"Spearman's correlation {number},\n$n$ = {len(pairs)}, {probability_text}", fontsize=9
     )
 
 

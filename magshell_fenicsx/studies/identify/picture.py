@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.figures import add_legend, lengths_along_line, saved_figure
+from magshell_fenicsx.studies.figures import (
+    PANEL_HEIGHT,
+    PANEL_WIDTH,
+    add_legend,
+    lengths_along_line,
+    saved_figure,
+)
 from magshell_fenicsx.studies.identify.data import OF_POINTS
 from magshell_fenicsx.studies.naming import key_words, result_label, split_unit
 
@@ -65,7 +71,7 @@ def draw_identified(
         panels += [partial(_field, field=field, number=i) for i in range(len(field["components"]))]
     if content["parameters"]:
         panels.append(partial(_parameters, parameters=content["parameters"]))
-    with saved_figure(file, 4.2 * len(panels), 3.6) as figure:
+    with saved_figure(file, PANEL_WIDTH * len(panels), PANEL_HEIGHT) as figure:
         plots = figure.subplots(1, len(panels), squeeze=False)[0]
         for plot, panel in zip(plots, panels, strict=True):
             panel(plot)
@@ -115,15 +121,7 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
             )
         has_labels = True
         if len(rows_of_states) > 1:  # the last one of the drawn curves is that of the measurement
-            x, y = (values[-1] for values in np.array(coordinates) + np.array(u))
-            plot.annotate(
-                _state_words(state),
-                (x, y),
-                (-6, 3),
-                textcoords="offset points",
-                ha="right",
-                fontsize=8,
-            )
+            _name_end(plot, np.array(coordinates) + np.array(u), _state_words(state))
     # the undeformed places, once
     plot.plot(
         *coordinates,
@@ -137,7 +135,26 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     labels = [f"${axis[1]}$" + (f"  ({unit[1]})" if unit else "") for axis in plane_axes]
     plot.set(xlabel=labels[0], ylabel=labels[1])
     plot.set_aspect("equal", adjustable="datalim")
+    plot.locator_params(nbins=5)
     add_legend(plot)
+
+
+def _name_end(plot: Any, curve: Array, words: str) -> None:
+    """Write words at the last point of a curve (2, n): to its right, or above it if it ends low.
+
+    A curve that ends in the upper half of what is drawn so far leaves room to its right.
+    """
+    (x, y), (_, (low, high)) = curve[:, -1], (plot.get_xlim(), plot.get_ylim())
+    is_high = y > (low + high) / 2
+    plot.annotate(
+        words.replace(" of ", "\nof "),
+        (x, y),
+        (6, 0) if is_high else (0, 14),
+        textcoords="offset points",
+        ha="left" if is_high else "right",
+        va="top" if is_high else "bottom",
+        fontsize=8,
+    )
 
 
 def _coordinates(
@@ -328,7 +345,7 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
     ]
     plot.set_yticks(range(len(names)), names, fontsize=8)
     plot.set(
-        xlabel="95 % bands: data (blue), prior (grey), in %", xlim=(-120 * widest, 120 * widest)
+        xlabel="95 % bands in %:\ndata (blue), prior (grey)", xlim=(-120 * widest, 120 * widest)
     )
     plot.axvline(0.0, color="0.4", lw=0.6)
 
@@ -348,7 +365,7 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
         Name of the picture file.
     """
     columns = list(dict.fromkeys(row["result"] for row in rows))
-    with saved_figure(file, 4.6 * len(columns), 3.6) as figure:
+    with saved_figure(file, PANEL_WIDTH * len(columns), PANEL_HEIGHT) as figure:
         plots = figure.subplots(1, len(columns), squeeze=False)[0]
         for plot, column in zip(plots, columns, strict=True):
             # labels that the legend shall have, each once
