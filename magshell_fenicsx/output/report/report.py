@@ -49,7 +49,7 @@ PICTURES = {  # in the order of the report
     "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
     "field_maps.png": "The magnetic field beside the shell at the last point: field lines and |B|.",
     "solutions.png": "The end of the path, and the solutions that the search has found.",
-    "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h, "
+    "shell.png": "The deformed shell at the last point, coloured by the inward displacement, "
     "and its section; grey is the undeformed shell.",
     "animation.gif": "The shell along the path.",
     "magnetic_loads.png": (
