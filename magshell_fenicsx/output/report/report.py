@@ -225,9 +225,10 @@ def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup,
     dimensions, measured = summary["dimensions"], summary.get("in_units", {})
     magnetic = summary["case"].get("magnetic") or {}
     classical_pressure = measured.get("classical_pressure_Pa") if classical else None
+    ending, length_unit = ("_mm", "mm") if "radius_mm" in dimensions else ("", "m")
     values_and_units = {
-        "radius R": (dimensions["radius"], "m"),
-        "thickness h": (dimensions["thickness"], "m"),
+        "radius R": (dimensions[f"radius{ending}"], length_unit),
+        "thickness h": (dimensions.get(f"thickness{ending}"), length_unit),
         "Young’s modulus E": (dimensions["youngs_modulus"], "Pa"),
         "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
         "classical pressure p<sub>c</sub>": (classical_pressure, "Pa"),
