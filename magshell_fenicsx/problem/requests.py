@@ -96,9 +96,10 @@ class OutputSection(Section):
     """From where the shell is seen; by default from above, on the side of its largest
     displacement"""
     ranges: dict[str, Range] = Field(default_factory=dict)
-    """Field -> values of the first and the last colour: w_over_h, E_1, E_2, M_1, M_2, stretch_1,
-    stretch_2, stretch_3, sigma_1, sigma_2, p_mag, f_mag, k, tau, couple, gap_over_h,
-    contact_pressure; by default those of the data"""
+    """Field -> values of the first and the last colour, over the field's unit (w over h) also in a
+    case with units: w_over_h, E_1, E_2, M_1, M_2, stretch_1, stretch_2, stretch_3, sigma_1,
+    sigma_2, p_mag, f_mag, k, tau, couple, gap_over_h, contact_pressure; by default those of the
+    data"""
     whole: bool = False
     """With the pictures of a half shell, write the whole one at every point for ParaView:
     fields/whole.pvd"""

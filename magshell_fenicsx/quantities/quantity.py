@@ -25,10 +25,12 @@ Kind = Literal[
     "reaction",
     "moment",
     "stress",
+    "field",
     "count",
     "text",
 ]
 SUPERSCRIPTS = str.maketrans("²³⁴", "234")
+PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}  # by powers of ten
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,11 @@ class CaseSizes:
         Applied flux density (mT), or strength of the sources (%), of a field strength of one.
     second
         The unit of time (s).
+    lambda_m
+        The dimensionless field at the state that is shown, with its sign; nan without a field, and
+        for one that has turned.
+    largest_field
+        Its largest magnitude on the shell there.
     """
 
     nu: float
@@ -55,6 +62,8 @@ class CaseSizes:
     applied: float = nan
     strength: float = nan
     second: float = nan
+    lambda_m: float = nan
+    largest_field: float = nan
 
     @property
     def h(self) -> float:
@@ -78,6 +87,9 @@ class CaseSizes:
         It is the size of numbers that are in SI already.
         """
         return 1.0 + 0.0 * self.R * self.E
+
+
+NO_UNITS = CaseSizes(nan, nan)  # of a case without units
 
 
 @dataclass(frozen=True)
@@ -204,8 +216,25 @@ def plain_text(text: str) -> str:
     return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
 
+def with_prefix(value: float, unit: str) -> tuple[float, str]:
+    """Return the size of a 1 in a unit with a prefix, and that unit, which suits a value.
+
+    The value is then from 1 to 1000.
+
+    Examples
+    --------
+    >>> with_prefix(32000.0, "Pa"), with_prefix(-0.012, "N/m"), with_prefix(0.0, "N")
+    ((0.001, 'kPa'), (1000.0, 'mN/m'), (1.0, 'N'))
+    """
+    order = 3 * floor(log10(abs(value)) / 3) if value else 0
+    power = min(max(order, min(PREFIXES)), max(PREFIXES))
+    return 10.0**-power, f"{PREFIXES[power]}{unit}"
+
+
 def _tex(text: str) -> str:
-    """Return text with Greek letters and powers as TeX writes them."""
+    """Return text with Greek letters, powers and hats as TeX writes them."""
+    text = re.sub("(\\w)\u0302", r"\\hat \1", text).replace("×", r"\times ")
+    text = re.sub(r"\^(\w+)", r"^\\mathrm{\1}", text)
     text = re.sub("[\u0391-\u03c9]", lambda greek: rf"\{_letter(greek[0])} ", text)
     return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
@@ -273,8 +302,8 @@ class Quantity:
     kind
         Kind of quantity, such as "load" or "energy".
     symbol
-        For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there
-        is no symbol.
+        For example "λ_m": Greek letters and powers in Unicode, an index after "_", a letter above
+        after "^"; empty if there is no symbol.
     units
         Units of the number, the first of them unless the case shows another; empty for a pure
         number.
@@ -347,7 +376,8 @@ class Quantity:
         >>> Quantity("", "", "", "load", "p/p_c").html
         'p/p<sub>c</sub>'
         """
-        return re.sub(r"_(\w+)", r"<sub>\1</sub>", self.symbol) or self.words
+        with_indices = re.sub(r"_(\w+)", r"<sub>\1</sub>", self.symbol)
+        return re.sub(r"\^(\w+)", r"<sup>\1</sup>", with_indices) or self.words
 
     @property
     def shown_unit(self) -> str:

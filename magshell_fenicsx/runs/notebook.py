@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed_by_symmetry, rotated_surface
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
+from magshell_fenicsx.output.pictures.colours import sizes_at
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import PICTURES, figures
 from magshell_fenicsx.output.pictures.rendering import run_camera
 from magshell_fenicsx.output.store.stored_results import pole_of
+from magshell_fenicsx.quantities.quantity import NO_UNITS
 from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.record import Record
@@ -144,11 +146,12 @@ def picture(
     """
     if of not in PICTURES:
         raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
-    shell = surface(scene, record)
+    shell, (row,) = surface(scene, record), rows(scene, [record])
     if shell is None:
         return None
-    style = scene.problem.output
-    pictures = figures(shell, scene.problem.material.h, style, run_camera(shell, style), [of])
+    style, camera = scene.problem.output, run_camera(shell, scene.problem.output)
+    sizes = sizes_at(scene.sizes.case or NO_UNITS, shell, row)
+    pictures = figures(shell, scene.problem.material.h, style, camera, [of], sizes)
     return _in_line(pictures[of]) if pictures else None
 
 

@@ -591,7 +591,7 @@ def in_units(result: Result) -> dict[str, float]:
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
     """Return the dimensions of the shell that the case gives, in SI or in the case's own units.
 
-    `units` says which. Keys that the case does not give are None.
+    `units` says which; lengths in SI stand in mm too. Keys that the case does not give are None.
     """
     if isinstance(shell, ShellSection):  # its lengths always have units
         lengths, is_in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
@@ -600,8 +600,10 @@ def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
             {"radius": shell.reference, "thickness": shell.thickness},
             shell.with_units,
         )
+    in_mm = {f"{key}_mm": 1e3 * x for key, x in lengths.items() if is_in_si and x is not None}
     return {
         **lengths,
+        **in_mm,
         "youngs_modulus": shell.youngs_modulus,
         "units": "SI" if is_in_si else "the case's own",
     }

@@ -3,6 +3,7 @@
 import io
 import re
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -27,7 +28,14 @@ from magshell_fenicsx.output.fields.vtu import (
     write_whole_shells,
 )
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.colours import ColouredField, loads, moments, strains
+from magshell_fenicsx.output.pictures.colours import (
+    ColouredField,
+    field_caption,
+    loads,
+    moments,
+    sizes_at,
+    strains,
+)
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import figure_files, png
 from magshell_fenicsx.output.pictures.picture import (
@@ -53,6 +61,7 @@ from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, c
 from magshell_fenicsx.output.store.stored_results import pole_of
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, PathTable, Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.quantity import CaseSizes
 
 Array = NDArray[np.float64]
 STYLE = OutputSection()
@@ -408,6 +417,68 @@ def test_numbers_of_a_short_bar_do_not_touch() -> None:
     box = figure.add_axes((0.2, 0.5, 0.5, 0.1))
     colour_bar(figure, box, Scale((-16.7, 16.7), SIGNED, "true stress"))
     assert [label.get_text() for label in box.get_xticklabels()] == ["−16.7", "0", "16.7"]
+
+
+def test_a_bar_with_two_signs_shows_its_zero() -> None:
+    """Unless the number of an end is there; at both kinds of bars."""
+    for orientation in ("horizontal", "vertical"):
+        shown = []
+        for low in (-1.4, -0.1):
+            figure = Figure(figsize=(4.0, 4.0))
+            box = figure.add_axes((0.2, 0.2, 0.6, 0.6))
+            colour_bar(figure, box, Scale((low, 20.0), SIGNED, "w"), orientation)
+            axis = box.xaxis if orientation == "horizontal" else box.yaxis
+            shown.append([label.get_text() for label in axis.get_ticklabels()])
+        assert ["0" in numbers for numbers in shown] == [True, False]
+        assert [numbers[0] for numbers in shown] == ["−1.4", "−0.1"]
+
+
+def bars(surface: Surface, sizes: CaseSizes, *names: str, **style: Any) -> dict[str, list[str]]:
+    """Caption of each colour bar -> its numbers."""
+    shown = figures(surface, 0.01, OutputSection(**style), Camera(ABOVE), names, sizes)
+    return {
+        axes.get_title(): [label.get_text() for label in axes.get_xticklabels()]
+        for figure in shown.values()
+        for axes in figure.axes
+        if axes.get_title()
+    }
+
+
+def test_bars_have_the_units_of_a_case() -> None:
+    """By hand, of R = 20 mm, h = 0.2 mm, E = 1.2 MPa, nu = 0.5, in a field of lambda_m = -0.01."""
+    sizes, values = CaseSizes(0.5, 100.0, 0.02, 1.2e6), np.array([0.0, 1.0, 2.0, 3.0])
+    fields = {
+        **dict.fromkeys(("M_1", "sigma_1", "contact_pressure", "p_mag"), values),
+        "M_2": -values,
+        "gap_over_h": np.zeros(4),
+        "Br": np.tile([1.0, 0, 0], (4, 1)),
+        "Ba": np.tile([0, 0.01, 0], (4, 1)),
+    }
+    surface = replace(plate(0.1), fields=fields)
+    row: Row = {"lambda_m": -0.01, "field_angle": 0.0}
+    found = bars(surface, sizes_at(sizes, surface, row))
+    stiffness = 1.2e6 * 0.2e-3**3 / (12 * 0.75)
+    moment = f"{1e6 * 2.5 * stiffness / 0.02:.3g}"  # of the colours' limit, without a peak
+    assert {caption: (texts[0], texts[-1]) for caption, texts in found.items()} == {
+        "inward normal displacement  $w$  (mm)": ("0", "2"),
+        "larger principal moment  $M_\\mathrm{1}$  (µN)": ("0", moment),
+        "smaller principal moment  $M_\\mathrm{2}$  (µN)": (f"−{moment}", "0"),
+        "true stress  $\\sigma_\\mathrm{1}$  (MPa)": ("0", "3.6"),
+        "gap  (mm)": ("0", "0.2"),
+        "contact pressure  $p$  (kPa)": ("0", "36"),
+        "couple  (N/m)": ("0", "2.4"),
+        "magnetic pressure  $p_\\mathrm{mag}$  (kPa)": ("−36", "0"),
+    }
+    # what has no unit in a field that has turned, or without a modulus, is over its own
+    turned = sizes_at(sizes, surface, row | {"field_angle": 30.0})
+    captions = bars(surface, turned, "magnetic_loads")
+    assert list(captions) == ["couple  (N/m)", field_caption("p_mag")]
+    without_modulus = bars(surface, replace(sizes, E=nan), "shell", "moments")
+    assert list(without_modulus)[1:] == [field_caption("M_1"), field_caption("M_2")]
+    assert "inward normal displacement  $w$  (mm)" in without_modulus
+    # ranges are over units
+    wide = bars(surface, sizes, "shell", ranges={"w_over_h": [0.0, 20.0]})
+    assert next(iter(wide.values()))[-1] == "4"
 
 
 def test_arrows_are_apart() -> None:

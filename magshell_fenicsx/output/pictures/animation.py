@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.bodies_and_magnets import near_places
-from magshell_fenicsx.output.pictures.colours import ColouredField
+from magshell_fenicsx.output.pictures.colours import ColouredField, in_units
 from magshell_fenicsx.output.pictures.curve import plot_curve
 from magshell_fenicsx.output.pictures.layout import FigureBoxes, Panel, directions, drawing
 from magshell_fenicsx.output.pictures.lines import (
@@ -30,6 +30,7 @@ from magshell_fenicsx.output.pictures.rendering import Camera, Image, Window
 from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
 from magshell_fenicsx.output.store.table import POLE, Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,6 +83,7 @@ def animated(
     frame_rows: Sequence[Row],
     camera: Camera,
     pole: str = POLE,
+    sizes: CaseSizes = NO_UNITS,
 ) -> bytes:
     """Return the animation of a path as the content of a GIF file.
 
@@ -97,12 +99,14 @@ def animated(
         Projection of the shell.
     pole
         Name of the point of w_pole_over_h.
+    sizes
+        Sizes of the case.
     """
     from PIL import Image as Pillow
 
     factor = magnification(surfaces)
     with drawing(STYLE):
-        views = _views(surfaces, h, factor, camera)
+        views = _views(surfaces, h, factor, camera, sizes)
         frames = _composed(views, factor, titles, rows, frame_rows, pole)
     # a GIF file has 256 colours; without dither they would look like contours
     dither = Pillow.Dither.FLOYDSTEINBERG
@@ -164,7 +168,9 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     return palette
 
 
-def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
+def _views(
+    surfaces: Sequence[Surface], h: float, factor: float, camera: Camera, sizes: CaseSizes
+) -> list[Panel]:
     """Return the panels of all frames, with one window and one scale of colours.
 
     Parameters
@@ -173,6 +179,8 @@ def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera)
         Thickness over R.
     factor
         Magnification of the displacements; colours show the true ones.
+    sizes
+        Sizes of the case.
     """
     lowest = min(float(surface.w.min()) for surface in surfaces)
     highest = max(float(surface.w.max()) for surface in surfaces)
@@ -184,7 +192,8 @@ def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera)
     window = Window.around(camera(np.concatenate(places)), WINDOW_WIDTH)
     panels = []
     for surface, magnified_surface in zip(surfaces, magnified, strict=True):
-        layer = ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
+        w = ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
+        layer = in_units(w, sizes)
         panels.append(
             Background(magnified_surface, camera, WINDOW_WIDTH, window).panel(layer, STYLE)
         )

@@ -1,6 +1,7 @@
 """Fields as colours: values, limits, captions with units.
 
-A field that is zero or unknown is named in a note and not drawn.
+A field that is zero or unknown is named in a note and not drawn. Fields are chosen, and their
+limits found, as numbers over their units; `in_units` gives them the units of a case.
 
 Input: a `Surface`, the deformed shell with fields at its nodes. Output: for each panel of a picture
 a `ColouredField`, and a note for its foot. Limits are the values at the ends of the colours.
@@ -12,61 +13,29 @@ applied magnetic field, h and R thickness and reference length, E is Young's mod
 stiffness.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from math import isnan
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.contact_peak import ContactPeak
-from magshell_fenicsx.output.fields.surface import SHELL, Surface
+from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, from_zero, round_limits
+from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.quantities.fields import FIELDS, in_case_unit
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes, Unit, with_prefix
+from magshell_fenicsx.quantities.stresses import MEMBRANE_FORCE
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
-STRAINS = {"E_1": "larger principal strain $E_1$", "E_2": "smaller principal strain $E_2$"}
-MOMENTS = {"M_1": "larger principal moment $M_1R/D$", "M_2": "smaller principal moment $M_2R/D$"}
-STRETCHES = {
-    "stretch_1": r"larger principal stretch $\lambda_1$",
-    "stretch_2": r"smaller principal stretch $\lambda_2$",
-    "stretch_3": r"stretch of the thickness $\lambda_3$",
-    "sigma_1": r"true stress $\sigma_1/E$",
-    "sigma_2": r"true stress $\sigma_2/E$",
-}
-LOADS = {  # caption with its unit, name in words
-    "couple": (
-        r"couple $|F\hat B^\mathrm{r} \times \hat B^\mathrm{a}|/(hE\lambda_\mathrm{m})$",
-        "couple of the remanence in the field",
-    ),
-    "p_mag": (r"magnetic pressure $p_\mathrm{mag}/(E\lambda_\mathrm{m})$", "magnetic pressure"),
-    "f_mag": (r"in-plane force $|f_\mathrm{mag}|/(E\lambda_\mathrm{m})$", "in-plane force"),
-    "k": (r"rotational springs $k/(hE\lambda_\mathrm{m})$", "rotational springs"),
-    "tau": (r"torque of gradients $|\tau(u)|/(hE\lambda_\mathrm{m})$", "torque of gradients"),
-}
-SCALARS = {  # captions of the interactive report, in HTML; of vectors the length
-    "w_over_h": "inward displacement w/h",
-    "E_1": "larger membrane strain E<sub>1</sub>",
-    "E_2": "smaller membrane strain E<sub>2</sub>",
-    "M_1": "larger bending moment M<sub>1</sub>R/D",
-    "M_2": "smaller bending moment M<sub>2</sub>R/D",
-    "stretch_1": "larger stretch λ<sub>1</sub>",
-    "stretch_2": "smaller stretch λ<sub>2</sub>",
-    "stretch_3": "stretch of the thickness λ<sub>3</sub>",
-    "sigma_1": "true stress σ<sub>1</sub>/E",
-    "sigma_2": "true stress σ<sub>2</sub>/E",
-    "mises_top": "von Mises stress/E of the outer face",
-    "mises_middle": "von Mises stress/E of the middle",
-    "mises_bottom": "von Mises stress/E of the inner face",
-    "couple": "couple |B<sup>r</sup>×B<sup>a</sup>|/(hEλ<sub>m</sub>)",
-    "p_mag": "magnetic pressure/(Eλ<sub>m</sub>)",
-    "f_mag": "magnetic in-plane force/(Eλ<sub>m</sub>)",
-    "k": "rotational springs/(hEλ<sub>m</sub>)",
-    "tau": "torque of gradients/(hEλ<sub>m</sub>)",
-    "gap_over_h": "gap/h",
-    "contact_pressure": "contact pressure pR/(Eh)",
-    "w0_over_h": "imperfections w<sub>0</sub>/h",
-    SHELL: "shell",
+STRAINS = ("E_1", "E_2")  # names of fields, the larger principal value first
+MOMENTS = ("M_1", "M_2")
+STRETCHES = ("stretch_1", "stretch_2", "stretch_3", "sigma_1", "sigma_2")
+LOADS = {  # in notes
+    "couple": "couple of the remanence in the field",
+    **{name: FIELDS[name].words for name in ("p_mag", "f_mag", "k", "tau")},
 }
 WITH_SIGN = {
     "w_over_h",
@@ -88,6 +57,7 @@ ZERO_FRACTION = 0.01  # of the larger of two fields: a smaller one is zero
 UNRESOLVED_JUMP = 0.05  # strains that differ more from cell to cell may be left out
 SMALL_STRAIN = 0.02  # strains over those of bending that may be left out
 UNKNOWN_RATIO = 1e-4  # strains over those of bending: for smaller ones the ratio is not said
+CONTACT_FORCE = Unit("E h R", "N", size=lambda g: g.E * g.h * g.R)
 MAX_CONTACT_SIZE = 0.15  # of a contact that is drawn alone, over the shell's extent
 CONTACT_MARGIN = 2.0  # size of the region around a contact over that of the contact
 MIN_PRESSED_CELLS = 12  # that resolve the distribution of a pressure
@@ -111,6 +81,8 @@ class ColouredField:
         Name of the colour map: `SIGNED`, `DISTANCE` or one of matplotlib's; empty for grey.
     caption
         Caption of the colour bar.
+    size
+        Size of a 1 of the field in the unit of `values` and `limits`.
     """
 
     name: str
@@ -118,13 +90,73 @@ class ColouredField:
     limits: tuple[float, float]
     colours: str
     caption: str
+    size: float = 1.0
+
+    def limits_within(self, ranges: Mapping[str, Sequence[float]]) -> tuple[float, float]:
+        """Return the limits, or those that the section `output` of a case gives for the field.
+
+        `ranges` maps the name of a field to limits over its own unit.
+        """
+        if self.name not in ranges:
+            return self.limits
+        return _scaled(ranges[self.name], self.size)
+
+
+def _scaled(limits: Sequence[float], size: float) -> tuple[float, float]:
+    """Return limits in another unit, in which a 1 has a size that may be negative."""
+    low, high = sorted(size * limit for limit in limits)
+    return low, high
+
+
+def field_caption(name: str) -> str:
+    """Return the caption of a field over its unit, in TeX.
+
+    Examples
+    --------
+    >>> field_caption("w_over_h"), field_caption("gap_over_h")
+    ('inward normal displacement $w/h$', 'gap$/h$')
+    """
+    field = FIELDS[name]
+    return f"{field.words} {field.latex}" if field.symbol else f"{field.words}$/{field.unit}$"
+
+
+def in_units(field: ColouredField, sizes: CaseSizes) -> ColouredField:
+    """Return a coloured field in the unit of a case; unchanged if the case has no such unit.
+
+    `sizes` are those of the case at the state that is shown.
+    """
+    if field.name not in FIELDS:  # a grey shell
+        return field
+    quantity = FIELDS[field.name]
+    in_unit, size = in_case_unit(quantity, sizes, max(map(abs, field.limits)))
+    if in_unit is quantity:
+        return field
+    return replace(
+        field,
+        values=size * field.values,
+        limits=_scaled(field.limits, size),
+        caption=in_unit.label,
+        size=size,
+    )
+
+
+def sizes_at(sizes: CaseSizes, surface: Surface, row: Row) -> CaseSizes:
+    """Return the sizes of a case with the magnetic field at the point of a row of path.csv.
+
+    The loads of a field that has turned are not those of the state: their unit is unknown.
+    """
+    if "Ba" not in surface.fields:
+        return sizes
+    largest = float(np.nan_to_num(np.linalg.norm(surface.fields["Ba"], axis=1)).max())
+    lambda_m = nan if row["field_angle"] else float(row["lambda_m"])
+    return replace(sizes, lambda_m=lambda_m, largest_field=largest)
 
 
 def shell(surface: Surface, h: float) -> list[ColouredField]:
     """Return the inward normal displacement w/h, white at zero."""
     w = np.asarray(surface.w / h, np.float64)
     limits = from_zero(float(w.min()), float(w.max()))
-    return [ColouredField("w_over_h", w, limits, SIGNED, "inward normal displacement $w/h$")]
+    return [ColouredField("w_over_h", w, limits, SIGNED, field_caption("w_over_h"))]
 
 
 def strains(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
@@ -179,8 +211,9 @@ def stretches(surface: Surface) -> list[ColouredField]:
     Nodes of shells of another law are nan.
     """
     fields = []
-    for name, caption in STRETCHES.items():
+    for name in STRETCHES:
         if (values := surface.fields.get(name)) is not None:
+            caption = field_caption(name)
             low, high = float(np.nanmin(values)), float(np.nanmax(values))
             if name.startswith("sigma"):
                 # rounding of a stress that is zero stays pale
@@ -218,7 +251,7 @@ def _largest(surface: Surface, names: Iterable[str]) -> float:
 
 
 def _principal(
-    surface: Surface, captions: dict[str, str], jump: float | None
+    surface: Surface, names: tuple[str, str], jump: float | None
 ) -> tuple[list[ColouredField], list[str]]:
     """Return two principal fields with the same colours, white at zero, and notes.
 
@@ -227,22 +260,21 @@ def _principal(
 
     Parameters
     ----------
-    captions
-        Name of each field -> caption, the larger principal value first.
+    names
+        Names of the fields, the larger principal value first.
     jump
         Difference of the cells' own values from the smooth field, relative; None for 0.
     """
-    if not captions.keys() <= surface.fields.keys():
+    if not set(names) <= surface.fields.keys():
         return [], []
-    first_name, second_name = captions
+    first_name, second_name = names
     # LIMIT_OVER_NOISE times the noise of the mesh: with that limit of colours the noise is pale
     limit_of_noise = _limit_far_above_noise(surface, first_name, second_name, jump or 0.0)
     limit = max(_limit_without_peaks(surface, first_name, second_name), limit_of_noise)
     fields, notes = list[ColouredField](), list[str]()
-    magnitudes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
-    for name, caption in captions.items():
-        values = surface.fields[name]
-        words, _, _ = caption.partition(" $")  # the caption without the symbol
+    magnitudes = {name: float(np.abs(surface.fields[name]).max()) for name in names}
+    for name in names:
+        values, words = surface.fields[name], FIELDS[name].words
         if magnitudes[name] < ZERO_FRACTION * max(magnitudes.values()):
             notes.append(f"The {words} is zero everywhere.")
             continue
@@ -255,7 +287,7 @@ def _principal(
         limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
         if max(magnitudes.values()) < ZERO_STRESS[first_name]:  # both are zero: white
             limits = -limit, limit
-        fields.append(ColouredField(name, values, limits, SIGNED, caption))
+        fields.append(ColouredField(name, values, limits, SIGNED, field_caption(name)))
     return fields, notes
 
 
@@ -313,14 +345,14 @@ def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
     if magnetic_couple is None:
         return [], ""
     coloured, zero_loads, unknown_loads = [], [], []
-    for name, (caption, words) in LOADS.items():
+    for name, words in LOADS.items():
         values = magnetic_couple if name == "couple" else fields.get(name)
         if values is None:
             unknown_loads.append(words)
             continue
         has_sign = values.ndim == 1  # a scalar; of a vector the length is drawn
         values = np.nan_to_num(values if has_sign else np.linalg.norm(values, axis=1))
-        largest = float(np.abs(values).max())
+        largest, caption = float(np.abs(values).max()), field_caption(name)
         if largest < ZERO_LOAD:
             zero_loads.append(words)
             continue
@@ -345,18 +377,19 @@ def contact(surface: Surface) -> list[ColouredField]:
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
     if not (np.isnan(pressure).any() or pressure.any()):
         return []
-    layers = [ColouredField("gap_over_h", gap, (0.0, 1.0), DISTANCE, "gap$/h$")]
+    caption = field_caption("gap_over_h")
+    layers = [ColouredField("gap_over_h", gap, (0.0, 1.0), DISTANCE, caption)]
     if (largest := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
-        caption = r"contact pressure $pR/(Eh)$"
+        caption = field_caption("contact_pressure")
         layers.append(ColouredField("contact_pressure", pressure, (0.0, largest), SIGNED, caption))
     return layers
 
 
-def pressure_note(surface: Surface) -> str:
+def pressure_note(surface: Surface, sizes: CaseSizes = NO_UNITS) -> str:
     """Return the note under the contact pressure.
 
     It says that no cell resolves the pressure, and the force per length; or the largest pressure
-    at a quadrature point, and that few cells carry it.
+    at a quadrature point, and that few cells carry it. `sizes` are those of the case.
     """
     pressure = surface.fields["contact_pressure"]
     # a pressure is nan where the contact is narrower than a cell
@@ -364,26 +397,39 @@ def pressure_note(surface: Surface) -> str:
     peak = surface.contact_peak
     if not largest:
         words = "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
-        return f"{words} {_line_force_text(peak)}".strip() if peak else words
+        return f"{words} {_line_force_text(peak, sizes)}".strip() if peak else words
     notes = []
     if is_unresolved:
         notes = ["Where the contact is narrower than a cell of the mesh, no pressure is drawn."]
     elif 0 < (number := int((pressure[surface.cells] > 0).all(axis=1).sum())) < MIN_PRESSED_CELLS:
         notes = [f"The pressure is a mean over each cell; {number} carry it."]
     if peak:
-        error_text = _error_text(peak.pressure_error)
+        largest_pressure, size = in_case_unit(FIELDS["contact_pressure"], sizes, peak.pressure)
+        symbol = largest_pressure.latex.replace(" ", "")
+        unit = f" {largest_pressure.shown_unit}" if largest_pressure.shown_unit else ""
         notes.append(
-            f"The largest at a quadrature point is $pR/(Eh)$ = {peak.pressure:.3g}{error_text}."
+            f"The largest at a quadrature point is {symbol} = "
+            f"{size * peak.pressure:.3g}{unit}{_error_text(peak.pressure_error)}."
         )
     return " ".join(notes)
 
 
-def _line_force_text(peak: ContactPeak) -> str:
+def _line_force_text(peak: ContactPeak, sizes: CaseSizes) -> str:
     """Return a sentence on the force of a contact whose pressure the mesh does not resolve."""
     error_text = _error_text(peak.force_error)
     if isnan(peak.line_force):
-        return f"Its force is {peak.force:.3g} $EhR${error_text}."
-    return f"Its force per length is {peak.line_force:.3g} $Eh${error_text}."
+        return f"Its force is {_amount(peak.force, CONTACT_FORCE, sizes)}{error_text}."
+    line_force = _amount(peak.line_force, MEMBRANE_FORCE, sizes)
+    return f"Its force per length is {line_force}{error_text}."
+
+
+def _amount(value: float, unit: Unit, sizes: CaseSizes) -> str:
+    """Return a number over a unit, and the unit in TeX; or both in the unit of a case."""
+    size = unit.size(sizes)
+    if isnan(size):
+        return f"{value:.3g} ${unit.key.replace(' ', '')}$"
+    factor, shown = with_prefix(size * value, unit.si)
+    return f"{factor * size * value:.3g} {shown}"
 
 
 def _error_text(relative_error: float) -> str:

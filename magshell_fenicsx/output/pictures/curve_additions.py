@@ -44,6 +44,8 @@ from magshell_fenicsx.output.pictures.sections import (
 from magshell_fenicsx.output.store.stored_results import case_in, pole_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.fields import FIELDS, in_case_unit
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
 from magshell_fenicsx.quantities.registry import QUANTITIES
 
 if TYPE_CHECKING:  # takes long to import
@@ -203,10 +205,11 @@ def add_shapes(
     shapes: Sequence[tuple[Row, Surface]],
     h: float,
     camera: Camera,
+    sizes: CaseSizes = NO_UNITS,
 ) -> None:
     """Draw the shell at some points on the curves of a figure, with a line from each to its point.
 
-    Each shell is where it covers least. All are of one scale, coloured by their own w/h; of shells
+    Each shell is where it covers least. All are of one scale, coloured by their own w; of shells
     whose pictures would be blades the sections are drawn. The title has the range of colours, and
     the factor of displacements that are too small to be seen.
 
@@ -220,6 +223,8 @@ def add_shapes(
         Thickness over R.
     camera
         Projection of all shells.
+    sizes
+        Sizes of the case.
     """
     panel_numbers = [_last_panel_with(row, panels) for row, _ in shapes]
     # one factor for the displacements of all shapes; it is in the titles
@@ -232,12 +237,9 @@ def add_shapes(
     fields = [
         ColouredField("", np.asarray(surface.w / h), limits, SIGNED, "") for _, surface in shapes
     ]
-    texts, _ = numbers([*limits])
-    colours = [f"{text} {colour}" for text, colour in zip(texts, ("blue", "red"), strict=True)]
-    words = f"shapes: $w/h$ = 0 white, {', '.join(text for text in colours if text[:2] != '0 ')}"
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
     sections = _sections_of_strips(magnified)
-    words = "shapes: sections; grey: undeformed" if sections else words
+    words = "shapes: sections; grey: undeformed" if sections else _words_of_colours(sizes, limits)
     words += f"\ndisplacements of shapes $\\times$ {factor:g}" if factor > 1 else ""
     for panel_number in dict.fromkeys(i for i in panel_numbers if i is not None):
         axes = figure.axes[panel_number]
@@ -261,6 +263,18 @@ def add_shapes(
         _add_shape(axes, image, point, corner, size_over_axes)
         if row["label"] not in LOCATED:  # those have marks
             axes.plot(*point, "o", color="k", markersize=MARK_SIZE, zorder=5)
+
+
+def _words_of_colours(sizes: CaseSizes, limits: tuple[float, float]) -> str:
+    """Return the range of the colours of shells, from w/h, in the unit of a case."""
+    w, size = in_case_unit(FIELDS["w_over_h"], sizes, max(map(abs, limits)))
+    unit = f" {w.shown_unit}" if w.shown_unit else ""
+    texts, _ = numbers([size * limit for limit in limits])
+    colours = [
+        f"{text}{unit} {colour}" for text, colour in zip(texts, ("blue", "red"), strict=True)
+    ]
+    ends = ", ".join(text for text in colours if text[:2] != "0 ")
+    return f"shapes: {w.latex} = 0 white, {ends}"
 
 
 def _sections_of_strips(surfaces: Sequence[Surface]) -> list[UprightSection]:

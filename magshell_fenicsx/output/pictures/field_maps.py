@@ -140,8 +140,15 @@ def _draw(
     B = size_of_unit * grid.values.reshape(ny, nx, 3)
     magnitude = np.linalg.norm(B, axis=-1)
     norm, largest, is_logarithmic = _colour_norm(magnitude)
-    image = axes.pcolormesh(
-        x, y, masked(_without_steps(magnitude)), norm=norm, cmap="viridis", shading="nearest"
+    # half a distance of points beyond the first and the last ones, where the limits of axes cut it
+    half_x, half_y = (float(values[1] - values[0]) / 2 for values in (x, y))
+    image = axes.imshow(
+        masked(_without_steps(magnitude)),
+        norm=norm,
+        cmap="viridis",
+        interpolation="bilinear",
+        origin="lower",
+        extent=(x[0] - half_x, x[-1] + half_x, y[0] - half_y, y[-1] + half_y),
     )
     _draw_field_lines(axes, x, y, [B @ e for e in directions], largest)
     lines = section(surface, grid)

@@ -22,7 +22,7 @@ from magshell_fenicsx.output.fields.mode_fields import mode_caption, mode_file, 
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_vtu
 from magshell_fenicsx.output.pictures.captions import in_mathematics, named_value
-from magshell_fenicsx.output.pictures.colours import ColouredField
+from magshell_fenicsx.output.pictures.colours import ColouredField, field_caption, in_units
 from magshell_fenicsx.output.pictures.layout import (
     GAP,
     INCH,
@@ -45,6 +45,8 @@ from magshell_fenicsx.output.pictures.rendering import Camera, Window
 from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.fields import FIELDS, in_case_unit
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown_quantity
 
 if TYPE_CHECKING:
@@ -169,9 +171,14 @@ def solution_rows(rows: Sequence[Row]) -> list[Row]:
 
 
 def solutions_figure(
-    surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
+    surfaces: Sequence[Surface],
+    rows: Sequence[Row],
+    h: float,
+    style: OutputSection,
+    camera: Camera,
+    sizes: CaseSizes = NO_UNITS,
 ) -> "Figure":
-    """Return the figure of the deformed shells of some rows, coloured alike by w/h.
+    """Return the figure of the deformed shells of some rows, coloured alike by w.
 
     Parameters
     ----------
@@ -179,29 +186,37 @@ def solutions_figure(
         Deformed shells, and their rows of path.csv: solutions, and ends of the path before them.
     h
         Thickness over R.
+    sizes
+        Sizes of the case.
     """
     lowest = min(float(surface.w.min()) for surface in surfaces)
     highest = max(float(surface.w.max()) for surface in surfaces)
-    limits, caption = from_zero(lowest / h, highest / h), "inward normal displacement $w/h$"
-    layers = [
+    limits, caption = from_zero(lowest / h, highest / h), field_caption("w_over_h")
+    fields = [
         ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, caption)
         for surface in surfaces
     ]
+    layers = [in_units(field, sizes) for field in fields]
+    w, size = in_case_unit(FIELDS["w_over_h"], sizes, max(map(abs, limits)))
+    unit = f" {w.shown_unit}" if w.shown_unit else ""
     captions = list[str]()
-    for number, (row, surface) in enumerate(zip(rows, surfaces, strict=True)):
+    for number, (row, layer) in enumerate(zip(rows, layers, strict=True)):
         stable_or_unstable, *_ = stability(row).split()  # the first word
-        largest = float(surface.w[np.abs(surface.w).argmax()]) / h
-        words = f"largest $w/h$ = {in_mathematics(largest, 4)}"
+        largest = float(layer.values[np.abs(layer.values).argmax()])
+        lines = [
+            f"{_name(row)}: {stable_or_unstable}",
+            f"largest {w.latex} = {in_mathematics(largest, 4)}{unit}",
+        ]
         # an earlier shell from which this one can hardly be told in a picture
         for earlier_row, earlier in zip(rows[:number], surfaces[:number], strict=True):
-            distance = float(np.linalg.norm(surface.u - earlier.u, axis=1).max()) / h
+            difference = np.linalg.norm(surfaces[number].u - earlier.u, axis=1)
+            distance = size * float(difference.max()) / h
             if distance < ALIKE * abs(largest):
-                words = (
-                    f"{words}\nat most {in_mathematics(distance, 2)} $h$ from {_name(earlier_row)}"
-                )
-        captions.append(f"{_name(row)}: {stable_or_unstable}\n{words}")
+                text = f"{in_mathematics(distance, 2)}{unit or ' $h$'}"
+                lines.append(f"at most {text} from {_name(earlier_row)}")
+        captions.append("\n".join(lines))
     with drawing(style):
-        note = "Lines are at round values of each shell's own $w/h$."
+        note = f"Lines are at round values of each shell's own {w.latex}."
         return small_panels(surfaces, layers, captions, style, camera, note)
 
 

@@ -27,6 +27,7 @@ from magshell_fenicsx.output.pictures.colours import (
     ColouredField,
     contact,
     contact_region,
+    in_units,
     loads,
     moments,
     pressure_note,
@@ -47,6 +48,7 @@ from magshell_fenicsx.output.pictures.rendering import Camera, Image, RenderedSu
 from magshell_fenicsx.output.pictures.scales import Scale, colour_map, contour_values, from_zero
 from magshell_fenicsx.output.pictures.sections import UprightSection, level_lines, upright_section
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
@@ -99,29 +101,35 @@ def _arrows_content(surface: Surface, h: float) -> Content:
     return Content(layers, far_bodies_note(surface))
 
 
-def _contact_content(surface: Surface) -> Content:
+def _contact_content(surface: Surface, sizes: CaseSizes) -> Content:
     """Return the content of the picture of contact, cut to the contact if that is small."""
     layers = contact(surface)
     if not layers:
         return Content([])
     detail = contact_region(surface)
     notes = [] if detail is None else ["The part of the shell around the contact."]
-    return Content(layers, " ".join([*notes, pressure_note(surface)]).strip(), detail)
+    return Content(layers, " ".join([*notes, pressure_note(surface, sizes)]).strip(), detail)
 
 
-PICTURES: dict[str, Callable[[Surface, float], Content]] = {
-    "shell": lambda surface, h: Content(shell(surface, h), far_bodies_note(surface)),
-    "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
-    "strains": lambda surface, h: Content(*strains(surface, h)),
-    "moments": lambda surface, h: Content(*moments(surface, h)),
-    "stretches": lambda surface, h: Content(stretches(surface)),
-    "fields": _arrows_content,
-    "contact": lambda surface, h: _contact_content(surface),
+# functions of the surface, the thickness over R, and the sizes of the case
+PICTURES: dict[str, Callable[[Surface, float, CaseSizes], Content]] = {
+    "shell": lambda surface, h, _: Content(shell(surface, h), far_bodies_note(surface)),
+    "magnetic_loads": lambda surface, h, _: Content(*loads(surface, h)),
+    "strains": lambda surface, h, _: Content(*strains(surface, h)),
+    "moments": lambda surface, h, _: Content(*moments(surface, h)),
+    "stretches": lambda surface, h, _: Content(stretches(surface)),
+    "fields": lambda surface, h, _: _arrows_content(surface, h),
+    "contact": lambda surface, h, sizes: _contact_content(surface, sizes),
 }
 
 
 def figures(
-    surface: Surface, h: float, style: OutputSection, camera: Camera, names: Sequence[str] = ()
+    surface: Surface,
+    h: float,
+    style: OutputSection,
+    camera: Camera,
+    names: Sequence[str] = (),
+    sizes: CaseSizes = NO_UNITS,
 ) -> dict[str, "Figure"]:
     """Return pictures of a whole deformed shell by name; empty pictures are left out.
 
@@ -133,11 +141,13 @@ def figures(
         Thickness over R.
     names
         Keys of `PICTURES` to draw; all of them by default.
+    sizes
+        Sizes of the case at the state of the surface, which give bars and notes their units.
     """
     drawn_figures, views = {}, dict[tuple[int, bool], Background]()
     has_bodies = bool(near_places(surface))
     for name in names or PICTURES:
-        content = PICTURES[name](surface, h)
+        content = PICTURES[name](surface, h, sizes)
         if not content.layers:
             continue
         width = panel_width(style, columns(len(content.layers)))
@@ -151,7 +161,7 @@ def figures(
                 views[key] = Background(seen_surface, camera, width)
             view = views[key]
         with drawing(style):
-            panels = [view.panel(layer, style) for layer in content.layers]
+            panels = [view.panel(in_units(layer, sizes), style) for layer in content.layers]
             if name == "shell":
                 panels[0] = replace(panels[0], section=visible_section(surface, view.window))
             drawn_figures[name] = panels_figure(panels, style, content.note)
@@ -279,7 +289,7 @@ class Background:
                 texts=texts,
                 names=names,
             )
-        low, high = style.ranges.get(layer.name, layer.limits)
+        low, high = layer.limits_within(style.ranges)
         colours = colour_map(layer.colours, (low, high))
         image = self.seen.coloured(layer.values, (low, high), colours)
         # whether there are values beyond an end of the bar, by more than rounding

@@ -29,6 +29,7 @@ from magshell_fenicsx.output.fields.vtu import (
 )
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
+from magshell_fenicsx.output.pictures.colours import sizes_at
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_panels, frequencies_figure
 from magshell_fenicsx.output.pictures.curve_additions import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.error_band import errors_at_points
@@ -52,11 +53,13 @@ from magshell_fenicsx.output.store.stored_results import (
     headline,
     pole_of,
     read_summary,
+    sizes_in,
     style_of,
 )
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.parts.bodies.contact_step import PRESSURE_MAX
 from magshell_fenicsx.parts.observables import MapGrid
+from magshell_fenicsx.quantities.quantity import CaseSizes
 from magshell_fenicsx.quantities.registry import field_columns
 
 MAX_PANELS = 12  # of solutions.png
@@ -117,6 +120,11 @@ class PicturedRun:
             return {}
         estimates: Mapping[str, float] = read_summary(self.folder).get("errors", {})
         return estimates
+
+    @cached_property
+    def sizes(self) -> CaseSizes:
+        """Sizes of the case, without those of the magnetic field at a point."""
+        return sizes_in(self.folder)
 
     @cached_property
     def camera(self) -> Camera:
@@ -288,7 +296,14 @@ def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, byte
     """Yield names and contents of the pictures of one point, named with its number."""
     surface, shell_data = run.surface_at(run.rows[point])
     shown_surface = without_zero_fields(surface, run.rows[point], run.rows)
-    for name, figure in figures(shown_surface, shell_data.h, run.style, run.camera).items():
+    drawn = figures(
+        shown_surface,
+        shell_data.h,
+        run.style,
+        run.camera,
+        sizes=sizes_at(run.sizes, surface, run.rows[point]),
+    )
+    for name, figure in drawn.items():
         yield from figure_files(figure, run.style, f"{name}_{point:04d}")
     if maps := run.maps_at(run.rows[point]):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, run.style)
@@ -313,7 +328,12 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
                     surface_of_shape, _ = run.surface_at(run.rows[number])
                     shells.append((run.rows[number], surface_of_shape))
                 add_shapes(
-                    curve, drawn_panels(run.rows, amplitude), shells, shell_data.h, run.camera
+                    curve,
+                    drawn_panels(run.rows, amplitude),
+                    shells,
+                    shell_data.h,
+                    run.camera,
+                    run.sizes,
                 )
         yield from figure_files(curve, style, "curve")
         if run.resolved.get("sensors"):
@@ -322,7 +342,9 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     # of the shell at one point, and of the field around it
     shown_surface = without_zero_fields(surface, run.headline, run.rows)
     shown_surface = with_contact_errors(shown_surface, run)
-    for name, figure in figures(shown_surface, shell_data.h, style, run.camera).items():
+    sizes = sizes_at(run.sizes, surface, run.headline)
+    drawn = figures(shown_surface, shell_data.h, style, run.camera, sizes=sizes)
+    for name, figure in drawn.items():
         yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, style)
@@ -342,7 +364,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
         yield from figure_files(figure, style, "gradients")
     if solutions := solution_rows(run.rows)[:MAX_PANELS]:
         surfaces, _ = zip(*(run.surface_at(row) for row in solutions), strict=True)
-        figure = solutions_figure(surfaces, solutions, shell_data.h, style, run.camera)
+        figure = solutions_figure(surfaces, solutions, shell_data.h, style, run.camera, run.sizes)
         yield from figure_files(figure, style, "solutions")
 
 
@@ -406,7 +428,16 @@ def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> st
     shell_data: ShellData = data_of_frames[0]
     amplitudes = list(dict.fromkeys(str(row["amplitude"]) for row in rows if row["amplitude"]))
     titles = [caption(shell_data.h, shell_data.nu, row, amplitudes) for row in frame_rows]
-    content = animated(surfaces, shell_data.h, titles, rows, frame_rows, run.camera, run.pole_name)
+    content = animated(
+        surfaces,
+        shell_data.h,
+        titles,
+        rows,
+        frame_rows,
+        run.camera,
+        pole=run.pole_name,
+        sizes=run.sizes,
+    )
     write_whole(folder / "animation.gif", content)
     return "animation.gif"
 

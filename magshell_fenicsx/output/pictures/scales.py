@@ -25,8 +25,10 @@ COLOURS = 257  # of a colour map
 END_DISTANCE = 0.16  # of a bar: ticks nearer to its ends give way to the numbers there
 END_DISTANCE_IN_LETTERS = 3.2  # the same on a short bar, in heights of a letter
 MAX_INTERVALS, STEPS = 5, (1, 2, 5, 10)  # between ticks of a bar
-STEP_TOLERANCE = 1e-9  # of logarithms
+STEP_TOLERANCE = 1e-9  # of logarithms, and of a zero over the length of a bar
 MAX_DECIMALS = 5  # after the first digit of the largest number
+ZERO_DISTANCE = 0.8  # least, of a zero from the end of a bar, in heights of a letter
+LINE_DISTANCE = 1.1  # least, of numbers at an upright bar, in heights of a letter
 DIGIT_WIDTH = 0.55  # of a number at a bar, in heights of a letter
 SHORT_BAR = 16  # heights of a letter
 PALENESS = 0.76  # part of matplotlib's colours in use: the others are darker than shade
@@ -160,23 +162,12 @@ def colour_bar(
         (False, True): "max",
         (False, False): "neither",
     }
-    inches = axes.get_position().width * figure.get_figwidth()
-    length = inches * 72 / rcParams["font.size"]  # in heights of a letter
-    is_short = orientation == "horizontal" and length < SHORT_BAR
+    is_horizontal, box = orientation == "horizontal", axes.get_position()
+    width, height = figure.get_size_inches()
+    inches = float(box.width * width if is_horizontal else box.height * height)
     low, high = scale.limits
-    inner_ticks = _inner_ticks(low, high, letters=length if is_short else None)
-    texts, power = numbers([low, *inner_ticks, high])  # power is their common power of ten
-    if orientation == "horizontal":  # texts of inner ticks beside those at the ends
-        is_apart = [
-            all(
-                abs(tick - end) / (high - low) * length > _distance_of_texts(text, texts[i])
-                for end, i in ((low, 0), (high, -1))
-            )
-            for tick, text in zip(inner_ticks, texts[1:-1], strict=True)
-        ]
-        inner_ticks = [tick for tick, apart in zip(inner_ticks, is_apart, strict=True) if apart]
-        inner_texts = [text for text, apart in zip(texts[1:-1], is_apart, strict=True) if apart]
-        texts = [texts[0], *inner_texts, texts[-1]]
+    length = inches * 72 / rcParams["font.size"]  # in heights of a letter
+    ticks, texts, power = _ticks(low, high, length, is_horizontal=is_horizontal)
     bar = figure.colorbar(
         ScalarMappable(Normalize(*scale.limits), colour_map(scale.colours, scale.limits)),
         cax=axes,
@@ -184,8 +175,10 @@ def colour_bar(
         extend=extend[scale.beyond],
         extendfrac=0.04,
     )
-    bar.set_ticks([low, *inner_ticks, high], labels=texts)
-    if orientation == "vertical":
+    bar.set_ticks(ticks, labels=texts)
+    if is_horizontal:
+        _make_room_for_zero(axes, ticks, texts, length / (high - low))
+    else:
         bar.set_label(f"{scale.caption}  ({power})" if power else scale.caption)
         return
     if power:  # beside the bar, where it meets no number
@@ -195,6 +188,63 @@ def colour_bar(
         _fit_into(title, room, figure)
 
 
+def _ticks(
+    low: float, high: float, length: float, *, is_horizontal: bool
+) -> tuple[list[float], list[str], str]:
+    """Return the ticks of a bar with its ends, their numbers, and the common power of ten.
+
+    Parameters
+    ----------
+    low, high
+        Values at the ends.
+    length
+        Length of the bar in heights of a letter.
+    """
+    is_short = is_horizontal and length < SHORT_BAR
+    ticks = [low, *_inner_ticks(low, high, letters=length if is_short else None), high]
+    texts, power = numbers(ticks)
+
+    def is_apart(number: int, end: int) -> bool:
+        """Whether the number of an inner tick does not touch that of an end, 0 or -1.
+
+        A zero may be so near that the number of the end gives way.
+        """
+        least_distance = LINE_DISTANCE
+        if is_horizontal and texts[number] == "0":
+            least_distance = ZERO_DISTANCE
+        elif is_horizontal:
+            least_distance = _distance_of_texts(texts[number], texts[end])
+        return abs(ticks[number] - ticks[end]) / (high - low) * length > least_distance
+
+    inner = [i for i in range(1, len(ticks) - 1) if is_apart(i, 0) and is_apart(i, -1)]
+    shown = [0, *inner, len(ticks) - 1]
+    return [ticks[i] for i in shown], [texts[i] for i in shown], power
+
+
+def _make_room_for_zero(
+    axes: "Axes", ticks: Sequence[float], texts: Sequence[str], letters_per_unit: float
+) -> None:
+    """Move the number of a bar's end outwards where it would touch a zero inside the bar.
+
+    `axes` is the horizontal bar with its ticks and their numbers.
+    """
+    from matplotlib import rcParams
+    from matplotlib.transforms import Affine2D
+
+    if "0" not in texts[1:-1]:
+        return
+    for end, direction in ((0, -1), (-1, 1)):
+        # how much nearer they are than they may be, in heights of a letter
+        lack = _distance_of_texts("0", texts[end]) - abs(ticks[end]) * letters_per_unit
+        if lack > 0:
+            label = axes.get_xticklabels()[end]
+            move = Affine2D().translate(direction * lack * rcParams["font.size"] / 72, 0.0)
+            inches_to_pixels = axes.figure.dpi_scale_trans
+            label.set_transform(
+                label.get_transform() + inches_to_pixels.inverted() + move + inches_to_pixels
+            )
+
+
 def _distance_of_texts(text: str, other: str) -> float:
     """Return the least distance of the middles of two numbers, in heights of a letter."""
     return DIGIT_WIDTH * (len(text) + len(other)) / 2 + DIGIT_WIDTH
@@ -202,6 +252,8 @@ def _distance_of_texts(text: str, other: str) -> float:
 
 def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
     """Return round values between the ends of a bar, not too near to the numbers there.
+
+    Zero may be as near as its number has room, which is not checked here.
 
     Parameters
     ----------
@@ -216,8 +268,11 @@ def _inner_ticks(low: float, high: float, letters: float | None) -> list[float]:
     if letters is not None:
         max_intervals = 3
         end_distance = max(END_DISTANCE, END_DISTANCE_IN_LETTERS / letters)
-    ticks = MaxNLocator(max_intervals, steps=STEPS).tick_values(low, high)
-    return [tick for tick in ticks if end_distance < (tick - low) / (high - low) < 1 - end_distance]
+    ticks = np.array(MaxNLocator(max_intervals, steps=STEPS).tick_values(low, high))
+    positions = (ticks - low) / (high - low)
+    is_zero = np.abs(ticks) < STEP_TOLERANCE * (high - low)
+    margins = np.where(is_zero, 0.0, end_distance)
+    return [float(tick) for tick in ticks[(margins < positions) & (positions < 1 - margins)]]
 
 
 def pixel_canvas(figure: "Figure") -> "FigureCanvasAgg":

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
 from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellate
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
-from magshell_fenicsx.output.pictures.colours import SCALARS, WITH_SIGN, couple
+from magshell_fenicsx.output.pictures.colours import WITH_SIGN, couple, sizes_at
 from magshell_fenicsx.output.pictures.lines import (
     SEGMENTS_PER_INTERVAL,
     CurveStep,
@@ -51,11 +51,12 @@ from magshell_fenicsx.output.pictures.lines import (
 )
 from magshell_fenicsx.output.pictures.rendering import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, colour_map, from_zero
-from magshell_fenicsx.output.store.stored_results import headline, pole_of, style_of
+from magshell_fenicsx.output.store.stored_results import headline, pole_of, sizes_in, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows, varying_columns
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
-from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.fields import FIELDS, in_case_unit_along_path
+from magshell_fenicsx.quantities.quantity import CaseSizes, Quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
 from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
@@ -217,11 +218,12 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     # vertices times frames are limited: at least MIN_FRAMES, more of a small mesh
     mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
     frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
-    # the shells of all frames, on the nodes of the headline's shell
-    surfaces_on_nodes = list[Surface]()
+    # the shells of all frames, on the nodes of the headline's shell, and the sizes of units there
+    surfaces_on_nodes, sizes, case_sizes = list[Surface](), list[CaseSizes](), sizes_in(folder)
     for row in frames:
         deformed, _ = read_point(fields, int(row["point"]))
         surfaces_on_nodes.append(on_nodes_of(deformed, surface))
+        sizes.append(sizes_at(case_sizes, deformed, row))
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {
@@ -237,7 +239,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
         "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in surfaces_on_nodes],
         "lines": [_lines(shell) for shell in surfaces_on_nodes],
         "solids": [_solids(shell, arrays) for shell in surfaces_on_nodes],
-        "fields": _fields(surfaces_on_nodes, mesh, shell_data.h, arrays),
+        "fields": _fields(surfaces_on_nodes, sizes, mesh, shell_data.h, arrays),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
     script = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
@@ -398,7 +400,7 @@ def _step(
         """Return the numbers in `rows` of the rows of a line."""
         return [number_of_point[int(row["point"])] for row in rows_of_line]
 
-    varied_quantity = quantity(amplitude(part.amplitude).column)
+    varied_column = amplitude(part.amplitude).column
     lines = [
         {
             "rows": numbers_of(line.rows),
@@ -408,9 +410,9 @@ def _step(
         for line in line_coordinates(part)
     ]
     return {
-        "title": curve_title([part]) or varied_quantity.words,
+        "title": curve_title([part]) or quantity(varied_column).words,
         "axes": [q.name for q in axes_for(part)],
-        "varied": varied_quantity.name,
+        "varied": shown_quantity(varied_column, rows[0]).name,
         "rows": numbers_of(part.rows),
         "lines": lines,
     }
@@ -468,16 +470,24 @@ def label(of_axis: Quantity, row: Row, pole: str) -> str:
     pole
         Words for the point of w_pole_over_h in a case without named points.
     """
-    at_point = with_point_name(of_axis, row, pole)
-    words = f"{at_point.words} {at_point.note}".strip()
-    unit = f" ({at_point.shown_unit})" if at_point.shown_unit else ""
-    minus = "−" if at_point.sign < 0 else ""
-    symbol = Markup(f" {minus}{at_point.html}") if at_point.symbol else ""
+    return _html_label(with_point_name(of_axis, row, pole))
+
+
+def _html_label(shown: Quantity) -> str:
+    """Return words, symbol and unit of a quantity as HTML."""
+    words = f"{shown.words} {shown.note}".strip()
+    unit = f" ({shown.shown_unit})" if shown.shown_unit else ""
+    minus = "−" if shown.sign < 0 else ""
+    symbol = Markup(f" {minus}{shown.html}") if shown.symbol else ""
     return str(Markup("{}{}{}").format(words, symbol, unit))
 
 
 def _fields(
-    shells: Sequence[Surface], mesh: SimplifiedSurface, h: float, arrays: "_Packed"
+    shells: Sequence[Surface],
+    sizes: Sequence[CaseSizes],
+    mesh: SimplifiedSurface,
+    h: float,
+    arrays: "_Packed",
 ) -> list[dict[str, Any]]:
     """Return every scalar field and every length of a vector field, for the page.
 
@@ -488,20 +498,23 @@ def _fields(
     ----------
     shells
         The surface at each frame, on the nodes of one mesh.
+    sizes
+        Sizes of the case at each frame.
     mesh
         Vertices at which values are shown.
     h
         Thickness over R.
     """
     fields = []
-    for name, caption in SCALARS.items():
+    for name, field in FIELDS.items():
         values = [_values(shell, name, h) for shell in shells]
         nodal_values = [
             values_of_shell for values_of_shell in values if values_of_shell is not None
         ]
         if len(nodal_values) < len(shells):
             continue
-        low, high, colours = _colour_scale(name, nodal_values)
+        caption, nodal_values, limit = _in_case_unit(field, nodal_values, sizes)
+        low, high, colours = _colour_scale(name, nodal_values, limit)
         if name == SHELL:
             names = [f"{i} {shell_name}" for i, shell_name in enumerate(shells[0].shells)]
             caption = f"{caption}: {', '.join(names)}"
@@ -525,20 +538,36 @@ def _fields(
     return fields
 
 
+def _in_case_unit(
+    field: Quantity, nodal_values: Sequence[Array], sizes: Sequence[CaseSizes]
+) -> tuple[str, list[Array], float]:
+    """Return a field in the unit of the case: label in HTML, values at each frame, size of a 1.
+
+    The size is the largest one of all frames. `nodal_values` and `sizes` are the values over the
+    field's own unit, and the sizes of the case, at each frame.
+    """
+    largest = [float(np.abs(values).max()) for values in nodal_values]
+    values_of_unit = largest if max(largest) > MIN_RANGE else [0.0] * len(largest)
+    in_unit, factors = in_case_unit_along_path(field, sizes, values_of_unit)
+    values = [factor * values for factor, values in zip(factors, nodal_values, strict=True)]
+    return _html_label(in_unit), values, max(map(abs, factors))
+
+
 def _colour_scale(
-    name: str, nodal_values: Sequence[Array]
+    name: str, nodal_values: Sequence[Array], unit_size: float
 ) -> tuple[float, float, list[tuple[float, str]]]:
     """Return the lower and the upper limit of a field over all frames, and its colours.
 
-    `nodal_values` are the field's values at each frame. Colours are pairs of a fraction of the
-    limits' range and a colour. Without pairs the page takes Plotly's own colour map.
+    `nodal_values` are the field's values at each frame, `unit_size` is the size of a 1 over the
+    field's own unit. Colours are pairs of a fraction of the limits' range and a colour. Without
+    pairs the page takes Plotly's own colour map.
     """
     low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
     high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
-    if high - low < MIN_RANGE:
+    if high - low <= MIN_RANGE * unit_size:
         low, high = low - 1.0, low + 1.0
     if name == "gap_over_h":  # what is farther than one thickness is grey
-        return 0.0, 1.0, _stops(DISTANCE)
+        return 0.0, unit_size, _stops(DISTANCE)
     if name in WITH_SIGN:
         low, high = from_zero(low, high)
         return low, high, _stops(SIGNED, (low, high))

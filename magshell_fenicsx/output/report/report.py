@@ -49,7 +49,7 @@ PICTURES = {  # in the order of the report
     "sensors.png": "What the sensors read of the field; dashed where the shell is unstable.",
     "field_maps.png": "The magnetic field beside the shell at the last point: field lines and |B|.",
     "solutions.png": "The end of the path, and the solutions that the search has found.",
-    "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h, "
+    "shell.png": "The deformed shell at the last point, coloured by the inward displacement, "
     "and its section; grey is the undeformed shell.",
     "animation.gif": "The shell along the path.",
     "magnetic_loads.png": (
@@ -225,9 +225,10 @@ def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup,
     dimensions, measured = summary["dimensions"], summary.get("in_units", {})
     magnetic = summary["case"].get("magnetic") or {}
     classical_pressure = measured.get("classical_pressure_Pa") if classical else None
+    ending, length_unit = ("_mm", "mm") if "radius_mm" in dimensions else ("", "m")
     values_and_units = {
-        "radius R": (dimensions["radius"], "m"),
-        "thickness h": (dimensions["thickness"], "m"),
+        "radius R": (dimensions[f"radius{ending}"], length_unit),
+        "thickness h": (dimensions.get(f"thickness{ending}"), length_unit),
         "Young’s modulus E": (dimensions["youngs_modulus"], "Pa"),
         "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
         "classical pressure p<sub>c</sub>": (classical_pressure, "Pa"),

@@ -8,6 +8,7 @@ the point whose displacement the column w_pole_over_h has.
 
 import json
 from collections.abc import Mapping, Sequence
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.parts.magnetism.fields import GROUPS as GROUPS_OF_FIELD
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.requests import OutputSection
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
 
 NUMBER_TYPES, NONE_TYPE = (int, float), type(None)
 PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
@@ -97,6 +99,25 @@ def read_summary(folder: Path) -> dict[str, Any]:
     if wrong := _first_error(summary, SUMMARY_TYPES):
         raise damage(folder / SUMMARY, wrong, may_be_earlier=True)
     return summary
+
+
+def sizes_in(folder: Path) -> CaseSizes:
+    """Return the sizes of a run's case from summary.json of its folder, as `case_sizes` has them.
+
+    They are those of a case without units if there is no summary yet.
+    """
+    if not (folder / SUMMARY).exists():
+        return NO_UNITS
+    summary = read_summary(folder)
+    groups, dimensions = summary["dimensionless"], summary["dimensions"]
+    in_si = dimensions["units"] == "SI"
+    R, E = (dimensions[key] if in_si else None for key in ("radius", "youngs_modulus"))
+    return CaseSizes(
+        nu=groups["poisson_ratio"],
+        R_over_h=groups["radius_to_thickness"],
+        R=nan if R is None else R,
+        E=nan if E is None else E,
+    )
 
 
 def _first_error(value: Any, types: Any, key: str = "") -> str:
