@@ -13,7 +13,7 @@ from conftest import CASES
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Sector
-from magshell_fenicsx.output.fields.contact_peak import ContactPeak, _along_surface
+from magshell_fenicsx.output.fields.contact_peak import ContactPeak, _along_meridian, _along_surface
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import (
     GAP_OPEN,
@@ -56,6 +56,25 @@ def test_a_ring_narrower_than_a_cell_has_no_pressure() -> None:
     assert surface.contact_peak.line_force == pytest.approx(force / ring, rel=1e-3)
     assert surface.contact_peak.force == pytest.approx(force)
     assert f"{force / ring:.3g} $Eh$" in pressure_note(surface)
+
+
+def test_a_ring_around_a_touched_spot() -> None:
+    """3 per length on a ring around a pole that touches with a thousandth of its pressure: the
+    ring is a line, and of the pole no pressure is drawn.
+    """
+    rho = np.concatenate([np.linspace(1e-4, 0.1, 50), [0.4]])
+    circumference, cell_length = 2 * np.pi * rho, 0.02
+    pressure = np.append(np.full(50, 1e-3), 1.0)
+    forces = np.append(1e-3 * circumference[:50] * 0.002, 3 * circumference[50])
+    places = np.column_stack([rho, 0 * rho])
+    cell_area = cell_length * np.maximum(circumference, np.pi * cell_length)
+    points = PressedPoints(places, pressure, forces / pressure, cell_area)
+    assert _along_meridian(points, forces) == pytest.approx(3)
+    fields = {"gap_over_h": np.zeros(3), PRESSURE: np.array([1e-3, 1e-3, np.nan])}
+    peak = ContactPeak(pressure=1.0, line_force=3.0, force=8.0)
+    surface = cast(Surface, SimpleNamespace(fields=fields, contact_peak=peak))
+    assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
+    assert "Its force per length is 3 $Eh$" in pressure_note(surface)
 
 
 def test_the_images_of_a_line_are_one_line() -> None:

@@ -78,15 +78,19 @@ def contact_peak(
 
 
 def _along_meridian(points: PressedPoints, forces: Array) -> float:
-    """Return the largest force per length of rings, each within the length of a cell."""
+    """Return the largest force per length of rings, each within the length of a cell.
+
+    It is nan if most of the force is in a spot about the axis.
+    """
     rho = points.places[:, 0]
     circumference = 2 * np.pi * np.maximum(rho, np.finfo(float).tiny)
     size = points.cell_area / circumference
-    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places, size)
-    sums = np.array([(forces[indices] / circumference[indices]).sum() for indices in neighbours])
-    largest = int(sums.argmax())
-    is_spot = rho[largest] < 2 * size[largest]  # about the axis
-    return nan if is_spot else float(sums[largest])
+    is_ring = rho > 2 * size
+    if forces[is_ring].sum() < forces.sum() / 2:
+        return nan
+    tree, per_length = scipy.spatial.cKDTree(points.places), forces / circumference
+    neighbours = tree.query_ball_point(points.places[is_ring], size[is_ring])
+    return float(max(per_length[indices].sum() for indices in neighbours))
 
 
 def _along_surface(points: PressedPoints, forces: Array) -> float:

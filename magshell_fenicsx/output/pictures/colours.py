@@ -60,6 +60,7 @@ UNKNOWN_RATIO = 1e-4  # strains over those of bending: for smaller ones the rati
 CONTACT_FORCE = Unit("E h R", "N", size=lambda g: g.E * g.h * g.R)
 MAX_CONTACT_SIZE = 0.15  # of a contact that is drawn alone, over the shell's extent
 CONTACT_MARGIN = 2.0  # size of the region around a contact over that of the contact
+MINOR_PRESSURE = 0.05  # over that of a contact narrower than a cell: less is not drawn beside it
 MIN_PRESSED_CELLS = 12  # that resolve the distribution of a pressure
 # colour limit: PEAK times this quantile of the area
 AREA_QUANTILE, PEAK = 0.997, 1.5
@@ -379,10 +380,21 @@ def contact(surface: Surface) -> list[ColouredField]:
         return []
     caption = field_caption("gap_over_h")
     layers = [ColouredField("gap_over_h", gap, (0.0, 1.0), DISTANCE, caption)]
-    if (largest := float(np.max(pressure, where=np.isfinite(pressure), initial=0.0))) > 0:
+    if (largest := _largest_resolved(surface)) > 0:
         caption = field_caption("contact_pressure")
         layers.append(ColouredField("contact_pressure", pressure, (0.0, largest), SIGNED, caption))
     return layers
+
+
+def _largest_resolved(surface: Surface) -> float:
+    """Return the largest contact pressure that the mesh resolves, over E h/R; 0 if it is minor.
+
+    A pressure is nan where the contact is narrower than a cell.
+    """
+    pressure, peak = surface.fields["contact_pressure"], surface.contact_peak
+    largest = float(np.nan_to_num(pressure).max())
+    is_minor = np.isnan(pressure).any() and peak and largest < MINOR_PRESSURE * peak.pressure
+    return 0.0 if is_minor else largest
 
 
 def pressure_note(surface: Surface, sizes: CaseSizes = NO_UNITS) -> str:
@@ -392,10 +404,8 @@ def pressure_note(surface: Surface, sizes: CaseSizes = NO_UNITS) -> str:
     at a quadrature point, and that few cells carry it. `sizes` are those of the case.
     """
     pressure = surface.fields["contact_pressure"]
-    # a pressure is nan where the contact is narrower than a cell
-    is_unresolved, largest = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
-    peak = surface.contact_peak
-    if not largest:
+    is_unresolved, peak = np.isnan(pressure).any(), surface.contact_peak
+    if not _largest_resolved(surface):
         words = "The contact is narrower than a cell of the mesh, so that no pressure is drawn."
         return f"{words} {_line_force_text(peak, sizes)}".strip() if peak else words
     notes = []
