@@ -12,7 +12,7 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.curve_additions import _section_image, _sections_of_strips
 from magshell_fenicsx.output.pictures.lines import CurveStep, curve_panels
-from magshell_fenicsx.output.pictures.mode_pictures import MODE_SIZE, mode_size
+from magshell_fenicsx.output.pictures.mode_pictures import MODE_SIZE, mode_size, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.rendering import has_snapped, run_camera
 from magshell_fenicsx.output.pictures.scales import numbers
@@ -185,3 +185,15 @@ def test_ticks_of_a_narrow_range_are_even() -> None:
     """Rounded to three digits they would be 1, 1.01, 1.01, 1.02."""
     texts, _ = numbers([1.0, 1.005, 1.01, 1.015])
     assert np.diff([float(text) for text in texts]) == pytest.approx(0.005)
+
+
+def test_solutions_that_look_alike_say_how_near_they_are() -> None:
+    """The second of three is 0.01 R or one thickness from the first, the third far from both."""
+    row = rows_of_loop()[0] | {"label": "solution", "excluded_pivots": 0}
+    rows = [row | {"branch": number} for number in (1, 2, 3)]
+    surfaces = [dome(-0.4), dome(-0.41), dome(-0.1)]
+    style = OutputSection()
+    figure = solutions_figure(surfaces, rows, 0.01, style, run_camera(surfaces[0], style))
+    texts = [text.get_text() for text in figure.texts]
+    assert [text for text in texts if "at most" in text] == [texts[2]]
+    assert "at most 1 $h$ from solution 1" in texts[2]
