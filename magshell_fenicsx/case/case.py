@@ -191,7 +191,7 @@ class Case(WithParts):
         `parts` are the changed shells in the order of the file; joints and pairs remain.
         """
         assert self.several
-        several = SeveralShells(parts, self.several.joints, self.several.pairs)
+        several = SeveralShells(parts, self.several.joints, self.several.pairs, self.several.bodies)
         shell = self.shell.model_copy(update={"file": several.file})
         assert isinstance(shell, MeshSurface)
         sections = {member.name: member.section for member in parts}

@@ -1,4 +1,5 @@
-"""Mesh sizes at contact: elements are small where shells that may touch are nearest.
+"""Mesh sizes at contact: elements are small where shells that may touch are nearest, and where
+a rigid body is nearest to one of several shells.
 
 Distances are those of the undeformed shells. A place (3,) is in space, a chart (2,) the pair of
 coordinates of a place on its surface. The gap of two places is the distance of the faces there:
@@ -14,9 +15,13 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
+from magshell_fenicsx.mesh.multi_shell import ShellPose
+from magshell_fenicsx.parts.bodies.body import BodySection, place_body
+from magshell_fenicsx.parts.bodies.body_setup import ContactZone
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
 from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
 CONTACT_CELL_SIZE = 0.5  # over sqrt(R h), where shells come into contact
@@ -30,7 +35,10 @@ FACE_CANDIDATES = 50  # places of a mid-surface among which that of the nearest 
 
 @dataclass(frozen=True)
 class ContactPlace:
-    """Place (2,) in the chart where another shell is nearest and elements must be small."""
+    """Place (2,) in the chart where another shell is nearest and elements must be small.
+
+    Before the shell has its chart it is the place (3,) in space.
+    """
 
     place: Array
 
@@ -109,6 +117,45 @@ def contact_places(
             if distance < MAX_GAP * mean_thickness[name]:
                 places_of_contact[name].append(nearest_places[name])
     return places_of_contact
+
+
+def body_zones(
+    bodies: Mapping[str, BodySection], reference: ReferenceShell, pose: ShellPose, R: float
+) -> list[ContactZone]:
+    """Return the zones of one of several shells in which rigid bodies press on it.
+
+    A body has a zone around the places where it is nearest, under the same conditions as another
+    shell. Bodies without a position, which begin on a shell, have none. Zones are in the shell's
+    own frame and over its own length.
+
+    Parameters
+    ----------
+    bodies
+        Name -> section.
+    reference, pose
+        The undeformed shell, and its place among all shells.
+    R
+        Reference length of all shells, in the unit of the sections.
+    """
+    h, places, zones = reference.h, reference.perfect.sample(), list[ContactZone]()
+    for name, section in bodies.items():
+        if section.position is None:
+            continue
+        in_space, position = pose(places), np.array(section.position) / R
+        nearest = in_space[np.linalg.norm(in_space - position, axis=1).argmin()]
+        # the normal from which the direction follows, where the case gives none
+        length = np.linalg.norm(position - nearest)
+        normal = (position - nearest) / length if length else np.eye(3)[2]
+        body = place_body(section, f"bodies.{name}", nearest, normal, 0.0, np.eye(3), R)
+        distances, *_ = section.distance(body)(in_space)
+        gaps = distances / pose.scale - reference.half_thickness(places)
+        similar = places[gaps < gaps.min() + GAP_TOLERANCE * h]
+        middle = similar.mean(axis=0)
+        is_one_place = _extent(similar, middle) < ONE_PLACE_DISTANCE * sqrt(h)
+        if is_one_place and gaps.min() < MAX_GAP * h:
+            radius = section.blunt_radius / (R * pose.scale)
+            zones.append(ContactZone.at_place(middle, radius, h))
+    return zones
 
 
 def _extent(places: Array, centre: Array) -> float:

@@ -169,8 +169,10 @@ def _refuse_unfit_conjugate(key: str, load: Step, step: ProgrammeStep) -> None:
         The step that would hold the conjugate.
     """
     if not load.conjugate:
+        # a pressure with a profile works on no volume, so that no gas holds it either
+        what = "a pressure with a profile" if getattr(load, "profile", None) else "it"
         raise ValueError(
-            f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
+            f"{key}: conjugate: nothing that can be held is conjugate to {what}; allowed: load"
         )
     # `released` is the reason why a conjugate cannot be held while the shell moves; it moves in a
     # motion, and where it is released at the end of a step

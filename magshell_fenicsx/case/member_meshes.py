@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.contact_mesh_size import ONE_PLACE_DISTANCE, ChartedShell, contact_places
+from magshell_fenicsx.case.contact_mesh_size import (
+    ONE_PLACE_DISTANCE,
+    ChartedShell,
+    ContactPlace,
+    body_zones,
+    contact_places,
+)
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import (
     ROUNDING,
@@ -27,6 +33,7 @@ from magshell_fenicsx.mesh.mirror import (
     rotation,
 )
 from magshell_fenicsx.mesh.multi_shell import MemberShell, MultiShellMesh
+from magshell_fenicsx.parts.bodies.body_setup import ContactZone
 from magshell_fenicsx.parts.shell_outline import reference_shell_of
 from magshell_fenicsx.parts.shell_sections import MeshSurface
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
@@ -137,7 +144,12 @@ class MemberMeshes:
 
         with part.naming():
             problem = make_problem(
-                part.case, plane=plane, contact_places=self._contact_places_of_shells[part.name]
+                part.case,
+                plane=plane,
+                contact_places=[
+                    *map(ContactPlace, self._contact_places_of_shells[part.name]),
+                    *self._body_zones(part),
+                ],
             )
             patch = problem.triangulated()
         place = self._several.place(part)
@@ -283,6 +295,16 @@ class MemberMeshes:
             to_own_frame = several.place(member).to_shell_frame
             own_places[member.name] = [to_own_frame(x) for x in places_of_contact[member.name]]
         return own_places
+
+    def _body_zones(self, part: "MemberCase") -> list[ContactZone]:
+        """Return the zones of a shell in which rigid bodies press on it."""
+        several = self._several
+        return body_zones(
+            several.bodies,
+            reference_shell_of(part.case.shell),
+            several.place(part),
+            several.parts[0].case.shell.reference,
+        )
 
     @property
     def _all_are_held(self) -> bool:

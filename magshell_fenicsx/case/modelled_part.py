@@ -171,7 +171,8 @@ def _inner_line_constraints(case: Case, outline: Outline) -> list[SymmetryConstr
     if joined := sorted(names & joined_edges):
         reason = f"{joined[0]}: is a joined edge that is held or loaded, which needs a surface"
     may_have_lines = case.several is not None or isinstance(case.shell, MeshSurface)
-    return [SymmetryConstraint(reason, mirrors=names_no_curve)] if may_have_lines else []
+    words = "a line within a mesh file that is held or loaded"
+    return [SymmetryConstraint(reason, (), names_no_curve, words)] if may_have_lines else []
 
 
 def _curves_of_mesh_files(case: Case, outline: Outline) -> set[str]:
@@ -293,8 +294,8 @@ def _symmetry(
     # other
     plane = common_mirror(constraints, outline, loosely=case.symmetry == "half")
     if case.symmetry == "half" and plane is None:
-        if name := energy_without_mirror(constraints, outline):
-            raise CaseError(f"symmetry: half: the energy {name} does not share it")
+        if words := energy_without_mirror(constraints, outline):
+            raise CaseError(f"symmetry: half: {words} does not share it")
         hint = ""
         if case.several:
             hint = "; each shell is held, and its own image in it"

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ValidationError
 from magshell_fenicsx.case.shells import MemberCase, OneOfShells, SeveralShells, Shells
 from magshell_fenicsx.input.section import Section, numbers_with_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.kinds import LawKeys
+from magshell_fenicsx.parts.bodies.body import BodySection
+from magshell_fenicsx.parts.kinds import Bodies, LawKeys
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.shell_sections import ShellSection
 
@@ -42,6 +43,12 @@ class _ShellsAlone(Section):
     """Section `shells` alone, for messages with the keys of the case."""
 
     shells: Shells
+
+
+class _BodiesAlone(Section):
+    """Section `bodies` alone."""
+
+    bodies: Bodies
 
 
 def merge_shells(
@@ -85,7 +92,9 @@ def merge_shells(
         for name, section in sections.items()
     ]
     joined_edges = _joined_edges(_with_mesh_names(data.get("joints"), sections))
-    several = SeveralShells(member_shells, joined_edges, _pairs(data.get("contact")))
+    several = SeveralShells(
+        member_shells, joined_edges, _pairs(data.get("contact")), _bodies(data.get("bodies"))
+    )
     # the data of the case, with one shell that stands for all of them
     common_keys = _common_shell(member_shells)
     merged_data = {
@@ -421,6 +430,14 @@ def _pairs(contact: Any) -> list[list[str]]:
     ]
     pairs = [[*entry] for entry in entries if isinstance(entry, list | tuple)]
     return [pair for pair in pairs if _is_pair_of_names(pair)]
+
+
+def _bodies(bodies: Any) -> Mapping[str, BodySection]:
+    """Return the section `bodies`; none of wrong entries, which are refused later."""
+    try:
+        return _BodiesAlone.model_validate({"bodies": bodies or {}}).bodies
+    except ValidationError:
+        return {}
 
 
 def _is_pair_of_names(entry: list[Any]) -> bool:

@@ -103,7 +103,7 @@ def make_problem(
     terms: Sequence[OwnTerm] = (),
     plane: Mirror | None = None,
     smooth: Collection[str] = (),
-    contact_places: Sequence[Array] = (),
+    contact_places: Sequence[ContactPlace | ContactZone] = (),
 ) -> Problem:
     """Return the problem of a case: mesh, loads, supports and output, nothing of it built yet.
 
@@ -119,7 +119,7 @@ def make_problem(
     smooth
         Keys of the case whose formulas are known to have no details between samples.
     contact_places
-        Places (3,) over R where other shells touch this one; the mesh is refined there.
+        Places (3,) over R where other shells or bodies touch this one; the mesh is refined there.
 
     Raises
     ------
@@ -648,7 +648,7 @@ def _mesh_plan(
     part: ModelledPart,
     points: _VertexPoints,
     formulas: _ResolvedFormulas,
-    contact_places: Sequence[Array],
+    contact_places: Sequence[ContactPlace | ContactZone],
 ) -> _MeshPlan:
     """Return the shape to be meshed and the element sizes, for the modelled part of a shell.
 
@@ -663,7 +663,7 @@ def _mesh_plan(
     formulas
         Formulas of the case, with the cells that resolve them.
     contact_places
-        Places (3,) over R, in the frame of the case, where other shells touch this one.
+        Places (3,) over R, in the frame of the case, where other shells or bodies touch this one.
 
     Raises
     ------
@@ -678,8 +678,11 @@ def _mesh_plan(
     contact_regions = _contact_regions(case, bodies, replace(shell.reference, imperfect=outline))
     # the charts of places where other shells touch this one, in the model's frame
     charted_places = [
-        ContactPlace(chart_of(rotation(part.turn) @ x, outline, half=part.is_symmetric))
-        for x in contact_places
+        replace(
+            touched,
+            place=chart_of(rotation(part.turn) @ touched.place, outline, half=part.is_symmetric),
+        )
+        for touched in contact_places
     ]
     # squares in which formulas or spread imperfections need small elements, and the largest size
     varying, largest = _size_limits(case, shell, outline, part, formulas)
@@ -911,12 +914,24 @@ def _warnings(case: Case, places: Array) -> tuple[str, ...]:
     """
     contributors = case.context.contributors()
     warnings = [contributor.warning(context, places) for contributor, context in contributors]
-    warnings.append(_unit_warning(case, places))
+    warnings += [_unit_warning(case, places), _warning_of_landing(case)]
     for member in case.members:
         own_context = replace(member.case.context, steps=case.context.steps)
         warning = inflation_warning(own_context, member.name)
         warnings.append(warning and member.refused(warning))
     return tuple(warning for warning in warnings if warning)
+
+
+def _warning_of_landing(case: Case) -> str | None:
+    """Return a warning that the snap of a shell onto a shell takes long; None without one."""
+    snaps = [step.load.end.snap for step in case.programme if step.load.end.snap]
+    if not case.contact or not any(snap.errors == "motion" for snap in snaps):
+        return None
+    return (
+        "then: snap, where shells may touch: a landing takes minutes; "
+        "snap: {damping: 1, errors: step} comes to rest in a part of that time, and control: arc, "
+        "until: points, without then, has the equilibria alone"
+    )
 
 
 def _unit_warning(case: Case, places: Array) -> str | None:

@@ -22,6 +22,7 @@ from magshell_fenicsx.input.section import ChosenByKey, Direction, FileKeys, Sec
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.multi_shell import MultiShellMesh, ShellPose
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.parts.bodies.body import BodySection
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.shell_sections import ShellSection, Surface
@@ -202,6 +203,8 @@ class SeveralShells:
         Pairs of names of edges that are joined, such as ("a_top", "b_bottom").
     pairs
         Pairs of names of shells that may touch.
+    bodies
+        Name -> section of each rigid body; meshes are fine where one is near.
     """
 
     def __init__(
@@ -209,8 +212,10 @@ class SeveralShells:
         parts: Sequence[MemberCase],
         joints: Sequence[tuple[str, str]] = (),
         pairs: Sequence[Sequence[str]] = (),
+        bodies: Mapping[str, BodySection] | None = None,
     ) -> None:
         self.parts, self.joints, self.pairs = parts, joints, pairs
+        self.bodies = bodies or {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SeveralShells":
         return self
@@ -229,6 +234,7 @@ class SeveralShells:
                 *(section.pending_modes for section in member.case.imperfections.values()),
             ]
             contents.append(content)
+        contents += [[name, body.model_dump_json()] for name, body in self.bodies.items()]
         return hashlib.sha256(
             json.dumps([contents, self.joints, self.pairs], sort_keys=True).encode()
         ).hexdigest()

@@ -543,7 +543,8 @@ def _named_vertices(
             text, nearest_text = distinguishable_texts(place, nearest_place)
             raise MeshError(
                 f"points.{name}: ({text}) in the file's coordinates is no vertex of the mesh; "
-                f"the nearest is ({nearest_text})"
+                f"the nearest is ({nearest_text}). Points of stress that are neither loaded nor "
+                "held may be anywhere"
             )
         vertices[name] = nearest
     return vertices

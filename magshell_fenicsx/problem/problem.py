@@ -385,9 +385,14 @@ class Problem:
     def support_hint(self) -> str:
         """Advice for a message about a shell that is not held; empty where it does not help.
 
-        It helps where static steps need supports and a motion needs none: the load of the static
-        step may act within the motion instead.
+        Planes of symmetry need a point that is held along them. Where static steps need supports
+        and a motion needs none, the load of the static step may act within the motion instead.
         """
+        if any(condition in ("plane", "symmetry") for condition in self.conditions.values()):
+            return (
+                "; planes of symmetry hold it across them alone: hold a point along them too, for "
+                "instance points: {top: [0, 0, 50 mm]}, boundary: {top: {held: [x, y]}}"
+            )
         if self.moves_freely or not any(map(_needs_inertia_alone, self.programme)):
             return ""
         return (

@@ -171,7 +171,7 @@ class _ModeWriter:
                 continue
             # on rank 0, of a mode of the model itself: the number of waves, if it has any
             if waves := waves_around(surface):
-                self.say(_waves_message(number, waves))
+                self.say(_waves_message(number, waves, str(row["label"])))
 
     def modes(self, section: StabilitySection) -> None:
         """Write the modes of least stiffness that a stability section requests, and stability.csv.
@@ -228,11 +228,19 @@ class _ModeWriter:
         return write_mode_of(self.result.scene_of(number), gathering, file, state, label, vector)
 
 
-def _waves_message(point: int, waves: WaveCount) -> str:
-    """Return a message about the waves of a null vector; a warning if they are not resolved."""
+def _waves_message(point: int, waves: WaveCount, label: str) -> str:
+    """Return a message about the waves of a null vector; a warning if they are not resolved.
+
+    `label` says whether the point is a fold or a bifurcation.
+    """
     m, largest = waves.number, waves.largest
     if waves.resolved:
-        return f"the null vector at point {point} has {m} waves around e3"
+        words = f"the null vector at point {point} has {m} waves around e3"
+        if label == "fold":
+            words += (
+                ": most often a bifurcation that the mesh or an imperfection perturbs to a fold"
+            )
+        return words
     return (
         f"warning: the null vector at point {point} has {m} waves around e3, "
         f"and the mesh resolves {largest}"

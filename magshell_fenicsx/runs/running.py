@@ -35,7 +35,8 @@ from magshell_fenicsx.output.store.durable import errors_as_damage, read_result
 from magshell_fenicsx.output.store.folder import DiskError, access_disk, locked_folder, user_folder
 from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.output.store.run_identity import empty_checkpoint
-from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
+from magshell_fenicsx.output.store.stored_results import pole_of
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, pole_name
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
 from magshell_fenicsx.problem.problem import Problem
@@ -514,7 +515,10 @@ def _estimate_errors(result: Result, output: RunOutput) -> None:
         output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
     estimates = result.error_estimates
     for name in estimates.too_coarse:
-        output.say(f"warning: no estimated error of {name}: {estimates.reasons[name]}")
+        way_on = "compare with a larger mesh.refinement"
+        if result.scene.problem.mesh.tolerance is None:
+            way_on = "mesh.tolerance, such as 1e-3, finds a mesh and gives one; or " + way_on
+        output.say(f"warning: no estimated error of {name}: {estimates.reasons[name]}: {way_on}")
 
 
 def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:
@@ -741,7 +745,7 @@ def _follow(
     Stopped, NoEigenpair, Interrupted, DiskError
         If the path ends early. The result has the points before that.
     """
-    scene, row_maker = result.scene, RowMaker(result.scene)
+    scene, row_maker, pole = result.scene, RowMaker(result.scene), ""
     for record in follow(scene, remark=result.remarks.append):
         # at the first point, which comes before the first solve of a step, the files are opened,
         # and the scene takes their journal
@@ -772,14 +776,17 @@ def _follow(
                 files.write(row, record.point.state, record.scene or scene)
         replayed = files is not None and len(result.rows) <= files.complete_points
         progress.accepted(row, is_known=replayed)
+        pole = pole or pole_name(row, pole_of(scene.problem.document.data)).removeprefix("the ")
         if not replayed:
-            output.say(_line(row))
+            output.say(_line(row, pole))
+            if record.said:  # at once, since the path may take long from here on
+                output.say(f"warning: {record.said}")
 
 
-def _line(row: Row) -> str:
+def _line(row: Row, pole: str) -> str:
     """Return a point as one line of at most 79 columns: loads, displacements, iterations.
 
-    `row` is the point's row of path.csv.
+    `row` is the point's row of path.csv, `pole` the name of the point of `w_pole_over_h`.
     """
     # column of the amplitude that varied; empty without
     varied = ""
@@ -802,10 +809,11 @@ def _line(row: Row) -> str:
     excluded = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
     if row["negative_pivots"] or excluded:
         fields.append(f"unstable {row['negative_pivots']}{excluded}")
-    # the other loads, where they are not zero, and the displacement of the pole, if it is another
+    # the other loads, where they are not zero, and the displacement of the pole, the tip or the
+    # first named point, if it is another
     fields += [_value(name, row, formats[name]) for name in formats if name != varied and row[name]]
     if row["w_pole_over_h"] != row["w_over_h"]:
-        fields.append(_value("w_pole_over_h", row, "8.4f", "pole"))
+        fields.append(_value("w_pole_over_h", row, "8.4f", pole))
     return fit_to_columns([*fields, f"it {row['iterations']}"], LINE_COLUMNS)
 
 

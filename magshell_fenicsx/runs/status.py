@@ -19,7 +19,7 @@ from magshell_fenicsx.output.store.table import SOLUTION, Row
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import format_number
-from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown_quantity
+from magshell_fenicsx.quantities.registry import Sizes, amplitude, shown_quantity
 from magshell_fenicsx.simulate.scene import Scene
 
 EVENT_WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}
@@ -77,8 +77,7 @@ class PathEnd:
         shown = shown_quantity(self.column, row)
         size, unit = 1.0, ""  # of a column without a second one in units
         if shown.name != self.column:
-            size = self.sizes.by_unit.get(quantity(self.column).scale, 1.0)
-            unit = f" {shown.si}"
+            size, unit = self.sizes.size(self.column), f" {shown.si}"
         value = format_number(float(row[shown.name]), ".4g")
         if self.end is None:
             return f"{shown.ascii_symbol} {value}{unit} -> {self.words}"

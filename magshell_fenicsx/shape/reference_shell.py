@@ -125,6 +125,12 @@ class ReferenceShell:
         """Whether distances on the shell are angles."""
         return self.edge_polar is not None
 
+    @property
+    def has_pole_or_tip(self) -> bool:
+        """Whether the surface has a place that stands for none given: its pole or a strip's tip."""
+        outline = self.perfect
+        return outline.highest is not None and (outline.disc or self.geometry == "strip")
+
     @cached_property
     def _thickness_formula(self) -> Callable[..., Array] | None:
         """The formula of the thickness factor as a function of x, y, z; None without one."""
@@ -237,9 +243,7 @@ def _place(at: At, ground: ReferenceShell, key: str) -> Array:
             raise CaseError(f"{key}.at{_off_sphere_text(at, ground)}")
         return direction
     # elsewhere only the pole or the tip has a direction, which is zero
-    has_pole_or_tip = perfect.disc or ground.geometry == "strip"
-    is_elsewhere = at.polar or not has_pole_or_tip
-    if perfect.highest is None or is_elsewhere:
+    if perfect.highest is None or at.polar or not ground.has_pole_or_tip:
         raise CaseError(
             f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}"
         )

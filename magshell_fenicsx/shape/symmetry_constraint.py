@@ -57,7 +57,8 @@ class SymmetryConstraint:
     mirrors
         Function that tells whether a plane is a symmetry of the part.
     energy
-        Name of the energy that states the constraint; "" for other parts.
+        The energy, or the line within the surface, that states the constraint, in words; "" for
+        other parts.
     azimuths
         Azimuths (rad) of further planes through e3 that may be preserved.
     """
@@ -195,7 +196,7 @@ def why_not_axisymmetric(parts: Sequence[SymmetryConstraint]) -> str | None:
 
 
 def energy_without_mirror(parts: Sequence[SymmetryConstraint], outline: "Outline") -> str | None:
-    """Return the name of a user's energy that keeps a case from being modelled as a half.
+    """Return the energy or line, in words, that keeps a case from being modelled as a half.
 
     It does not allow the mirror plane that all other parts have in common. None if there is no such
     energy, or no such plane.

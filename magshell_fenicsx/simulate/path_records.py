@@ -63,6 +63,9 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 # load at which a path ends, over that of the first excluded instability
 MAX_RATIO_TO_EXCLUDED = 2.0
 LOCATED = ("fold", "bifurcation")
+TINY_STEP = 1e-4  # over the longest step of a path
+TINY_STEPS = 15  # successive tiny steps after which a path in contact is said to creep
+RESOLVING_SIZE = 0.4  # of elements that resolve a contact, over sqrt(R h)
 MAX_CONTACT_CHANGES = 10  # times that a first point gets stiffer penalties or new cuts
 FIRST_STEP_REDUCTION = (
     1 / 16
@@ -297,6 +300,8 @@ class _StageRecords:
         Words on the last fold, for a message; "" so far.
     _furthest
         Largest amplitude at which the path goes on; finite once an excluded mode is unstable.
+    _tiny_steps
+        The last points, each a tiny step after the one before.
     _stop_reason, _is_final
         Why the last run has stopped, "" if it has not; and whether no run may go on from there.
     """
@@ -308,6 +313,7 @@ class _StageRecords:
         self._branch_switch: BranchSwitch | None = None
         self._fold_text = ""
         self._furthest = np.inf
+        self._tiny_steps: list[Point] = []
         self._stop_reason, self._is_final = "", False
 
     def records(self) -> Records:
@@ -427,9 +433,21 @@ class _StageRecords:
         if label == "fold":
             value = amount(stage.scene, path.name, point.state.mu[path.name])
             self._fold_text = f"; the last fold is at {value}"
-        remark = cluster_remark(stage.scene, run, point)
+        remark = cluster_remark(stage.scene, run, point) or self._remark_on_tiny_steps(path, point)
         unstable = self._monitor.unstable
         return Record(label, path.name, point, mode, excluded_pivots=unstable, said=remark)
+
+    def _remark_on_tiny_steps(self, path: Path, point: Point) -> str:
+        """Return a remark on a path that creeps since something touches; else "".
+
+        It stands once, at the point where so many steps were tiny.
+        """
+        earlier, tiny = self._tiny_steps, TINY_STEP * path.options.largest
+        is_tiny = bool(earlier) and abs(point.s - earlier[-1].s) < tiny
+        self._tiny_steps = [*earlier, point] if is_tiny else [point]
+        if len(self._tiny_steps) != TINY_STEPS + 1 or not self._stage.scene.model.all_contacts:
+            return ""
+        return creeping_remark(self._stage.scene)
 
     def _reason(self, path: Path, records_ahead: Sequence[Record]) -> str:
         """Return the reason why the path has stopped, in words; "" if it has reached its goal.
@@ -787,6 +805,23 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     return (
         f"a fold and another instability between {first_amount} and {last_amount} are too close "
         "to be located one by one"
+    )
+
+
+def creeping_remark(scene: Scene) -> str:
+    """Return the remark on a path whose steps stay tiny since something touches a shell."""
+    problem = scene.problem
+    h, given_size = problem.material.h, problem.mesh.size
+    size = RESOLVING_SIZE * np.sqrt(h) * problem.length
+    if given_size:
+        size = min(size, given_size / 2)
+    unit, text = scene.sizes.column("w_over_h"), f"{size:.2g}"
+    if unit:  # w_over_h has the thickness as its unit
+        measured = size / (h * problem.length) * scene.sizes.size("w_over_h")
+        text = f"{measured:.2g} {unit.si}"
+    return (
+        "the steps stay tiny where the shell touches something, most often since its elements are "
+        f"too large there: give mesh.size: {text}"
     )
 
 

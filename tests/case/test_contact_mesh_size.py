@@ -123,3 +123,27 @@ def test_the_place_of_thick_faces() -> None:
     met = MemberMeshes(several)._contact_places_of_shells
     assert met["thick"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)
     assert met["flat"][0] == pytest.approx([0.3, 0.6, 0], abs=1e-4)
+
+
+@pytest.mark.parametrize("direction", [{}, {"direction": [1, 0, 0]}])
+def test_cells_are_small_where_a_body_is_near(direction: dict[str, Any]) -> None:
+    """A strip of several shells beside a bar: about a third of the bar's radius there, as a strip
+    alone has; and larger without the bar.
+    """
+    plate = {"geometry": "plate", "length": 1, "width": 0.25, "thickness": 0.025}
+    material = {"youngs_modulus": 1, "poisson_ratio": 0}
+    data = {
+        "shells": {"a": {"shell": plate | material, "boundary": {"left": "clamped"}}},
+        "loading": {"kind": "edge", "moves": [{"supports": ["a.left"], "translation": [0, 0, 1]}]},
+    }
+    bar = {"kind": "cylinder", "radius": 0.15, "axis": [0, 1, 0], "position": [0.8, 0.1, 0.17]}
+
+    def size(**others: Any) -> float:
+        """Mean length of the sides of the cells below the bar."""
+        mesh = Case.from_source({**data, **others}).problem().triangulated()
+        corners = mesh.nodes[mesh.cells[:, :3]][:, :, :3]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+        return float(sides[abs(corners.mean(axis=1)[:, 0] - 0.8) < 0.1].mean())
+
+    assert size(bodies={"bar": bar | direction}) == pytest.approx(0.05, rel=0.3)
+    assert size() > 0.08

@@ -296,3 +296,29 @@ def test_models_of_a_balloon() -> None:
         volume.append(float(fold["volume_change"]))
     assert p[1:] == pytest.approx([p[0]] * 2, rel=5e-4)
     assert volume[1:] == pytest.approx([volume[0]] * 2, rel=1e-2)
+
+
+def test_half_of_a_closed_balloon() -> None:
+    """A hemisphere on its plane of symmetry, its top held across the axis: the largest pressure of
+    a sphere, 2 mu h/R (1/s - 1/s^7) at s = 7^(1/6); 1e-6.
+    """
+    source = {
+        "shell": {
+            "geometry": "cap",
+            "polar": 90,
+            "radius": "50 mm",
+            "thickness": "0.5 mm",
+            "youngs_modulus": "1.5 MPa",
+            "poisson_ratio": 0.5,
+            "law": "neo-hookean",
+        },
+        "points": {"top": [0, 0, "50 mm"]},
+        "boundary": {"rim": "symmetry", "top": {"held": ["x", "y"]}},
+        "loading": {"kind": "pressure", "control": "volume", "volume_change": "1e6 mm^3"}
+        | {"until": "limit", "points": 10},
+        "mesh": {"refinement": 0.6},
+    }
+    stretch = 7 ** (1 / 6)
+    pressure = 2 * 0.5e6 * 0.01 * (1 / stretch - stretch**-7)
+    found = run(Case.from_source(source))
+    assert float(found.rows[-1]["pressure_Pa"]) == pytest.approx(-pressure, rel=1e-6)

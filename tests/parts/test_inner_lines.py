@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sheets import Sheet, write
 
-from magshell_fenicsx import Case, Scene
+from magshell_fenicsx import Case, CaseError, Scene
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.follow import follow
 
@@ -114,7 +114,10 @@ def test_a_line_is_not_clamped_or_halved(tmp_path: Path) -> None:
         from_file(tmp_path, {"over": "all", "pressure": 1}, a_2="clamped").problem().triangulated()
     with pytest.raises(MeshError, match="edge: a_2: is a line within the surface"):
         Scene(from_file(tmp_path, {"edge": "a_2", "moment": 1}))
-    assert Scene(from_file(tmp_path, {"edge": "a_2", "force": [0, 0, 1]})).model.multiplicity == 1
+    whole = from_file(tmp_path, {"edge": "a_2", "force": [0, 0, 1]})
+    assert Scene(whole).model.multiplicity == 1
+    with pytest.raises(CaseError, match=r"half: a line within a mesh file .* does not share it"):
+        whole.model_copy(update={"symmetry": "half"}).problem()
     solid = from_file(tmp_path, {"over": "all", "pressure": 1}, model="solid", a_2="hinged")
     with pytest.raises(MeshError, match=r"boundary\.a_2: the surface has no such edge"):
         solid.problem().triangulated()

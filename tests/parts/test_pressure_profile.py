@@ -34,7 +34,8 @@ def loaded(profile: str, **further: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("text", "degree"),
     [("1", 0), ("0", -1), ("z - z", -1), ("1 - z/0.3", 1), ("(x + y)**2*z - x**3", 3),
-     ("sqrt(2)*x", 1), ("abs(z)", None), ("1/z", None), ("2**z", None), ("z**0.5", None)],
+     ("sqrt(2)*x", 1), ("1e-20*z", 1), ("abs(z)", None), ("1/z", None), ("2**z", None),
+     ("z**0.5", None)],
 )  # fmt: skip
 def test_degree_of_a_polynomial(text: str, degree: int | None) -> None:
     assert polynomial_degree(text) == degree
@@ -213,9 +214,17 @@ def test_refused(loading: dict[str, Any], message: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("profile", "symmetry"), [("2 - z + x*y**2 + x**2*y", "half"), ("2 - x", "axisymmetric")]
+)
+def test_a_profile_without_the_symmetry_is_named(profile: str, symmetry: str) -> None:
+    with pytest.raises(CaseError, match=rf"{symmetry}: loading\.profile does not share it"):
+        make_problem(capped(loading=loaded(profile), symmetry=symmetry))
+
+
+@pytest.mark.parametrize(
     ("step", "message"),
     [
-        (pushed({"gas": {"ambient_over_pc": 2}}), "allowed: load"),
+        (pushed({"gas": {"ambient_over_pc": 2}}), "to a pressure with a profile; allowed: load"),
         (pushed("conjugate"), "allowed: load"),
         (loaded("1"), "another profile"),
         ({"kind": "edge", "moves": [{"supports": ["rim"], "translation": [0, 0, 1]}]}, "lids"),

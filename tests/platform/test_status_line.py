@@ -25,6 +25,7 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.terminal import LAUNCHER_VARIABLES, live_line
+from magshell_fenicsx.quantities.quantity import DISTANCE
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import PathEnd, RunProgress, time_left
 
@@ -281,6 +282,8 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
 def test_where_a_path_leads() -> None:
     """To a value, through a number of steps, or nobody knows how far."""
     row = {"p_over_pc": 0.25, "w_over_h": 5.0}
+    moved = PathEnd("motion", 1.0, sizes=Sizes(distances={"motion": (DISTANCE, 2.0)}))
+    assert moved.text({"motion": 0.5, "motion_mm": 1.0}) == "motion 1 -> 2 mm"
     assert PathEnd("w_over_h", 21.0).completed_part({"w_over_h": 1.0}, row, 7) == 0.2
     assert PathEnd("w_over_h", words="28 steps", steps=28).completed_part(row, row, 7) == 0.25
     assert PathEnd("p_over_pc", words="the first instability").completed_part(row, row, 7) is None

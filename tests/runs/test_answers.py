@@ -5,16 +5,20 @@ headline names.
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from command import magshell, read_path
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice
 from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY, follow
+from magshell_fenicsx.simulate.path_records import TINY_STEPS, _StageRecords, creeping_remark
 
 MESH = {"degree": 3, "refinement": 0.7}
 
@@ -206,3 +210,50 @@ def test_better_round_than_that_of_the_mesh_that_is_taken() -> None:
         {"result": 0.330001, "error_estimate": 2e-6},
     )
     assert made.account(0.5)["best"] is None
+
+
+def test_line_names_the_watched_point() -> None:
+    """The first named point of a case in place of the pole, where it is not the loaded point."""
+    case = Case.from_source(
+        in_units(22, "0.5 mm", points={"side": ["0 mm", "6 mm", "29.39387691 mm"]})
+        | {"loading": {"kind": "indentation", "depth": 0.1, "points": 1}, "mesh": MESH}
+    )
+    lines = list[str]()
+    found = run(case, say=lines.append)
+    last = next(line for line in lines if " target " in line)
+    assert f"side {found.rows[-1]['w_pole_mm']:9.5g} mm" in last
+    assert "pole" not in last
+
+
+def test_snap_onto_a_shell_is_told_before() -> None:
+    """What is faster than its landing; not where that is taken already."""
+    shell = {"geometry": "cap", "radius": 1, "polar": 20, "thickness": 0.02}
+    shell |= {"youngs_modulus": 1, "poisson_ratio": 0.3}
+    upper = {"shell": shell, "boundary": {"rim": "hinged"}, "place": {"position": [0, 0, 0.06]}}
+    lower = {"shell": shell, "boundary": {"rim": "hinged"}}
+    data = {"shells": {"lower": lower, "upper": upper}, "contact": [["upper", "lower"]]}
+    load = {"kind": "pressure", "on": {"upper": "outside"}, "until": "limit", "then": "snap"}
+
+    def told(**keys: Any) -> str:
+        return "".join(Case.from_source(data | {"loading": load | keys}).problem().warnings)
+
+    assert re.search("control: arc", told())
+    assert not told(snap={"errors": "step"})
+
+
+def test_creeping_contact_is_told() -> None:
+    """Once, after enough tiny steps, with a size of elements in the case's unit."""
+    bodies = {"plate": {"kind": "plane"}}
+    scene = Scene(Case.from_source(in_units(22, "0.5 mm", bodies=bodies, mesh=MESH)))
+    records = object.__new__(_StageRecords)
+    records._stage, records._tiny_steps = SimpleNamespace(scene=scene), []  # type: ignore[assignment]
+    path = SimpleNamespace(options=StepOptions(1.0, 2.0, 1e-5))
+    steps = [0, 1, *(1 + 1e-6 * np.arange(1, 2 * TINY_STEPS))]
+    said = [
+        records._remark_on_tiny_steps(path, SimpleNamespace(s=s))  # type: ignore[arg-type]
+        for s in steps
+    ]
+    assert [bool(text) for text in said].index(True) == 1 + TINY_STEPS
+    size = 0.4 * np.sqrt(30 * 0.5)
+    assert [text for text in said if text] == [creeping_remark(scene)]
+    assert creeping_remark(scene).endswith(f"mesh.size: {size:.2g} mm")

@@ -19,9 +19,10 @@ from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.mode_fields import mode_surface, wave_number
-from magshell_fenicsx.output.fields.ring import waves_around
+from magshell_fenicsx.output.fields.ring import WaveCount, waves_around
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.public import run
+from magshell_fenicsx.runs.modes import _waves_message
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
 
@@ -374,6 +375,13 @@ def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | N
     w = np.cos(m * (theta - 0.3)) * np.exp(-50 * (phi - 1.3) ** 2)
     cells = band_of_triangles(30, 400, closed=turn == 2)
     assert wave_number(drawn_mode(n0, w, cells)) == counted
+
+
+def test_a_fold_of_waves_is_a_perturbed_bifurcation() -> None:
+    """The run says so: the mesh of a half has no bifurcation where the perfect shell has one."""
+    waves = WaveCount(2, 9)
+    assert _waves_message(7, waves, "bifurcation").endswith("point 7 has 2 waves around e3")
+    assert "2 waves around e3: most often a bifurcation" in _waves_message(7, waves, "fold")
 
 
 @pytest.mark.parametrize("staggered", [0.0, 1 / 3, 0.5])

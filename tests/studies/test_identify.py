@@ -4,6 +4,7 @@ refused.
 
 import itertools
 import json
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +128,10 @@ def test_what_was_put_in_is_found(whole: Whole) -> None:
     rows = (out / "identify.csv").read_text().splitlines()
     assert len(rows) == 1 + 2 * len(FEW)
     assert "next: tip_uz_mm at 1 narrows" in whole.stdout
+    falling = [float(each) for each in re.findall(r"^ +\d+  noise of .* tip_uz (\S+),",
+                                                  whole.stdout, re.MULTILINE)]  # fmt: skip
+    assert falling[-1] < falling[0]
+    assert "misfit" not in whole.stdout  # it is a constant of the numbers of data and parameters
     for key, each in zip(KEYS, found, strict=True):
         band = f", 95 % between {each['low']:.6g} and {each['high']:.6g}"
         assert f"{key} = {each['value']:.6g} {each['unit']}".rstrip() + band in whole.stdout

@@ -450,9 +450,9 @@ class OwnTerm:
 
         # an axisymmetric model also has every plane through e3 as a mirror, such as y = 0
         is_shared = self.mirrored(Y0_PLANE) and turns
-        name = self.name + (" or what it observes" if self.observed else "")
+        words = f"the energy {self.name}{' or what it observes' if self.observed else ''}"
         return SymmetryConstraint(
-            None if is_shared else f"the energy {name} does not share it", (), mirrors, name
+            None if is_shared else f"{words} does not share it", (), mirrors, words
         )
 
     @property

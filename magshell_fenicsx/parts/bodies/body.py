@@ -145,7 +145,8 @@ class BodySection(Section):
     side: Literal["outside", "inside"] = "outside"
     """The side of the shell that it is on"""
     direction: Axis | None = None
-    """Of the approach; by default along the shell's normal at `at`, towards the shell"""
+    """Of the approach; by default along the shell's normal at `at`, towards the shell; of a body
+    that stays it only turns its axes"""
     position: Coordinates | None = None
     """Where it is at approach 0: a point of a plane, the middle of a rod's end, the centre of
     another body [the shell's length; over R if that has no unit]"""

@@ -28,6 +28,7 @@ from magshell_fenicsx.shape.reference_shell import ReferenceShell, locate
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 Array = NDArray[np.float64]
+DEFAULT_APPROACH = 10.0  # of a body without a target, over h
 RING_SIZE = 0.35  # of elements that show the ring of a contact, over sqrt(Rh)
 DEFAULT_STIFFNESS = 1e6  # over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
 # stiffness of a body that touches in a spot over the default, times 1 + R/its radius
@@ -141,7 +142,7 @@ def _place_on_shell(section: BodySection, reference: ReferenceShell, key: str) -
 
     It is `at`, or its default, unless the body has a `position` and no `at`. Then it is the place
     of the shell that is nearest to the position, if the normal at the default of `at` is not needed
-    since the direction is given, or if the shell is a mesh.
+    since the direction is given, or if the shell has no such default.
 
     Parameters
     ----------
@@ -149,8 +150,8 @@ def _place_on_shell(section: BodySection, reference: ReferenceShell, key: str) -
         Key of the body in the case file, for messages.
     """
     has_own_place = section.position is not None and "at" not in section.model_fields_set
-    needs_no_normal = reference.geometry == "mesh" or section.direction is not None
-    if has_own_place and needs_no_normal:
+    has_default_place = reference.spherical or reference.has_pole_or_tip
+    if has_own_place and (section.direction is not None or not has_default_place):
         places = reference.perfect.sample()
         from_body = places - np.array(section.position) / reference.R
         return np.asarray(places[np.linalg.norm(from_body, axis=1).argmin()])
@@ -189,7 +190,7 @@ class ContactZone:
     Attributes
     ----------
     place
-        Middle of the zone in the shell's chart.
+        Middle of the zone in the shell's chart; of several shells first the place (3,).
     reach
         Radius of the zone.
     size
@@ -207,8 +208,8 @@ class ContactZone:
         """Return the zone in which a body presses, up to the largest approach of the steps.
 
         For a plane its radius is about that of a ring, sqrt(2 R a) at an approach a, with margins.
-        For other bodies it is at most their radius and a margin. Without a target of the approach,
-        ten thicknesses are assumed.
+        For other bodies it is at most their radius and a margin. Without a target of the approach
+        `DEFAULT_APPROACH` is assumed.
 
         Parameters
         ----------
@@ -219,11 +220,17 @@ class ContactZone:
         reference
             The undeformed shell.
         """
-        h, size = reference.h, contact.size
-        approach = largest_approach(loads) or 10.0
+        approach = largest_approach(loads) or DEFAULT_APPROACH
+        place = reference.imperfect.inverse(contact.front)
+        return cls.at_place(place, contact.size, reference.h, approach)
+
+    @classmethod
+    def at_place(
+        cls, place: Array, size: float, h: float, approach: float = DEFAULT_APPROACH
+    ) -> "ContactZone":
+        """Return the zone around a place in which a body presses; the approach is over h."""
         ring_radius = 1.1 * sqrt(2 * approach * h)
-        reach = min(ring_radius + 0.5 * sqrt(h), size + sqrt(h))
-        return cls(reference.imperfect.inverse(contact.front), reach, size)
+        return cls(place, min(ring_radius + 0.5 * sqrt(h), size + sqrt(h)), size)
 
     def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
         """Return the discs of small elements that resolve the ring of the contact and a small body.

@@ -169,7 +169,9 @@ class PressureSection(PathStep):
             from magshell_fenicsx.parts.pressure.profile import PressureProfile
 
             term = PressureProfile(self.profile).energy_term("pressure")
-            constraints.append(term.symmetry_constraint(outline))
+            constraint, words = term.symmetry_constraint(outline), f"{context.step.key}.profile"
+            reason = constraint.not_axisymmetric and f"{words} does not share it"
+            constraints.append(replace(constraint, not_axisymmetric=reason, energy=words))
         return constraints
 
     def contribution(self, context: Context, modelled: Modelled) -> "Loads":

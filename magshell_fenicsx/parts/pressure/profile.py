@@ -41,7 +41,7 @@ def polynomial_degree(text: str) -> int | None:
         value = Polynomial([0.0]) + symbolic(text, FUNCTIONS, *line)
     except (TypeError, ValueError):
         return None
-    value = value.trim(ROUNDING)
+    value = value.trim(ROUNDING * float(np.abs(value.coef).max()))
     return int(value.degree()) if value.coef.any() else -1
 
 

@@ -184,14 +184,16 @@ class Design:
         }
         self.rows.append(row)
         access_disk(self.comm, self._write)
-        # the line of text: results, a note (in brackets behind results), the time that is left
+        # the line of text: the stage, results, a note (in brackets behind results), the time left
+        stage = f"stage {row['stage']}: " if "stage" in row else ""
         values = ", ".join(
-            f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items()
+            f"{key} = {value:.9g}{' R' if key == DISTANCE else ''}"
+            for key, value in (evaluation.values | evaluation.seen).items()
         )
         note = f" ({evaluation.note})" if values and evaluation.note else evaluation.note
         self.say(
             f"{row['evaluation']:5d}  "
-            f"{values}{note}{'  best' if row['best'] else ''}{self._time_left}"
+            f"{stage}{values}{note}{'  best' if row['best'] else ''}{self._time_left}"
         )
 
     @property

@@ -341,12 +341,20 @@ def _fit_and_predict(
             return None
         return np.array(prediction.values), np.array(prediction.slopes)
 
-    def report_step(step: int, x: Array, misfit: float) -> None:
-        """Say a step of the fit, with parameters (p,) and the misfit over the number of data."""
-        say(
-            f"{step:5d}  misfit {misfit:.4g} of the noise squared, "
-            f"{_parameters_text(parameters, x)}"
-        )
+    def report_step(step: int, x: Array, misfit: float, noise: Array) -> None:
+        """Say a step of the fit, with parameters (p,), and how near to the data it is.
+
+        That is the misfit over the number of data. But an estimated noise makes it a constant: then
+        the noise itself falls.
+        """
+        words = [
+            f"noise of {column.header} {deviation:.4g}"
+            for column, deviation in zip(table.columns, noise, strict=True)
+            if np.isnan(column.noise)
+        ]
+        if len(words) < len(table.columns):
+            words.insert(0, f"misfit {misfit:.4g} of the noise squared")
+        say(f"{step:5d}  {', '.join(words)}, {_parameters_text(parameters, x)}")
 
     try:
         posterior = fit_posterior(model, measured, start, size, section.steps, report_step)

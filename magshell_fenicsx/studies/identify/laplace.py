@@ -253,7 +253,7 @@ def fit_posterior(
     start: Array,
     size: Array,
     max_steps: int,
-    report_step: Callable[[int, Array, float], None],
+    report_step: Callable[[int, Array, float, Array], None],
 ) -> Posterior:
     """Fit the parameters by Gauss-Newton; steps are halved until the misfit falls.
 
@@ -270,7 +270,8 @@ def fit_posterior(
     max_steps
         Largest number of steps.
     report_step
-        Called with the number of each step, its parameters and the misfit over the number of data.
+        Called with the number of each step, its parameters, the misfit over the number of data, and
+        the noise of each column.
 
     Raises
     ------
@@ -290,7 +291,7 @@ def fit_posterior(
         scaled_residuals, A = measured.rows(y, J, x, noise)
         _refuse_unseen(A * size)
         misfit = float(scaled_residuals @ scaled_residuals)
-        report_step(step, x, misfit / len(measured.data))
+        report_step(step, x, misfit / len(measured.data), noise)
         if step == max_steps:  # the last pass only reports
             break
         # the full step, by least squares in scaled parameters; the iteration ends if the step is

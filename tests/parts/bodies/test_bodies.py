@@ -193,3 +193,13 @@ def test_a_ball_beside_a_hole(ball: dict[str, Any], message: str) -> None:
     assert contact.distance(np.array([[0, 0, 1.0]]))[0] == pytest.approx(0.5)
     with pytest.raises(CaseError, match=message):
         problem({"ball": {**BALL, **ball}}, shell=PART, boundary={"hole": "clamped"})
+
+
+def test_a_bar_that_stays_needs_no_direction() -> None:
+    """Above a plate, which has no pole: the bar is at its position, across the nearest normal."""
+    plate = {"geometry": "plate", "length": 1, "width": 0.5, "thickness": 0.02}
+    bar = {"kind": "cylinder", "radius": 0.2, "axis": [0, 1, 0], "position": [0.7, 0, 0.3]}
+    shell = plate | {"poisson_ratio": 0, "youngs_modulus": 1}
+    (contact,) = problem({"a": bar}, shell=shell, boundary={"left": "clamped"}).loads.contacts
+    assert contact.distance(np.array([[0.7, 0.2, 0]]))[0] == pytest.approx(0.1)
+    assert contact.direction == pytest.approx([0, 0, -1])
