@@ -38,6 +38,7 @@ from magshell_fenicsx.quantities.stresses import stress_columns, stress_quantity
 
 # Modes of the model itself in the column of modes; its symmetry excludes all others.
 OWN_MODES = ("", "symmetric", "asymmetric")
+LOAD_FACTOR = "load_factor"  # column of the factor of dead loads
 
 
 def _energy(
@@ -231,7 +232,7 @@ AMPLITUDES = {
             critical_names=("knockdown", "buckling_pressure_Pa"),
         ),
         Amplitude("force", "force", "w_over_h", "at the load"),
-        Amplitude("load", "load_factor", "w_over_h", "along the loads"),
+        Amplitude("load", LOAD_FACTOR, "w_over_h", "along the loads"),
         Amplitude(
             "lambda_m",
             "lambda_m",

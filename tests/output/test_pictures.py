@@ -36,7 +36,7 @@ from magshell_fenicsx.output.pictures.colours import (
     sizes_at,
     strains,
 )
-from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.curve import axis_label, curve_figure
 from magshell_fenicsx.output.pictures.layout import figure_files, png
 from magshell_fenicsx.output.pictures.picture import (
     PICTURES,
@@ -58,10 +58,12 @@ from magshell_fenicsx.output.pictures.rendering import (
     viewing_direction,
 )
 from magshell_fenicsx.output.pictures.scales import SIGNED, Scale, colour_bar, colour_map
-from magshell_fenicsx.output.store.stored_results import pole_of
+from magshell_fenicsx.output.report.interactive import label
+from magshell_fenicsx.output.store.stored_results import load_at_factor_one, pole_of
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS, PathTable, Row
 from magshell_fenicsx.problem.requests import OutputSection
-from magshell_fenicsx.quantities.quantity import CaseSizes
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
+from magshell_fenicsx.quantities.registry import quantity
 
 Array = NDArray[np.float64]
 STYLE = OutputSection()
@@ -487,6 +489,22 @@ def test_arrows_are_apart() -> None:
     distance = np.linalg.norm(chosen[:, None] - chosen, axis=2)
     assert distance[~np.eye(len(chosen), dtype=bool)].min() >= 0.3
     assert np.linalg.norm(r[:, None] - chosen, axis=2).min(axis=1).max() < 0.3
+
+
+def test_the_load_factor_tells_the_load() -> None:
+    """Forces in one direction are added; of forces in several, and without units, nothing is."""
+    sizes, row = CaseSizes(0.5, 100.0, 0.01, 1e6), dict[str, float | int | str]()
+
+    def load(*forces: list[float], units: CaseSizes = sizes) -> str:
+        loads = [{"at": "A", "force": force} for force in forces]
+        return load_at_factor_one({"loading": [{"kind": "dead", "loads": loads}]}, units)
+
+    assert load([0, 0, -0.02], [0, 0, -0.03]) == "50 mN"
+    assert load([0, 0, -0.02], [0, 0, 0.03]) == load([0, 0, -1], units=NO_UNITS) == ""
+    factor = quantity("load_factor")
+    assert axis_label(factor, row, load="50 mN") == "load factor  ($\\times$ 50 mN)"
+    assert label(factor, row, "the pole", "50 mN") == "load factor (× 50 mN)"
+    assert axis_label(factor, row) == label(factor, row, "the pole") == "load factor"
 
 
 def test_captions_tell_the_load() -> None:

@@ -16,6 +16,8 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.output.fields.vtu import read_point
+from magshell_fenicsx.output.report.interactive import interactive
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.quantities.registry import axes_of
 
@@ -87,6 +89,31 @@ def test_summary_and_final_line_in_units(buckled: tuple[Path, str]) -> None:
     assert not re.search(
         r"(?<![\w/])-0(\.0*)?(?![.\d])", printed
     )  # a folder may be called pytest-0
+
+
+def test_the_part_to_play_with_is_in_units(buckled: tuple[Path, str]) -> None:
+    """Displacements in mm, the couple and the pressure of the field by hand."""
+    folder, _ = buckled
+    case = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["case"]
+    part = interactive(folder, case)
+    if part is None:
+        pytest.skip("needs Plotly")
+    about = json.loads(part.about)
+    fields = {field["name"]: field for field in about["fields"]}
+    assert {name: fields[name]["label"] for name in ("w_over_h", "M_1", "couple", "p_mag")} == {
+        "w_over_h": "inward normal displacement w (mm)",
+        "M_1": "larger principal moment M<sub>1</sub> (µN)",
+        "couple": "couple (mN/m)",
+        "p_mag": "magnetic pressure p<sub>mag</sub> (Pa)",
+    }
+    shells = [read_point(folder / "fields", i)[0] for i in range(len(read_path(folder)))]
+    highest = max(float(shell.w.max()) for shell in shells)
+    assert fields["w_over_h"]["high"] == pytest.approx(1e3 * R * highest, rel=0.01)
+    # at the equator of a sphere that hardly deforms, remanence and field are along one line
+    strength = 63e-3 * 20e-3 / (4e-7 * pi)
+    assert 0 < fields["couple"]["high"] < 1e3 * strength * H
+    assert fields["p_mag"]["low"] == pytest.approx(-strength * H / R, rel=0.02)
+    assert {step["varied"] for step in about["steps"]} == {"applied_mT", "pressure_Pa"}
 
 
 def numbers_in(part: Any) -> Iterator[float]:

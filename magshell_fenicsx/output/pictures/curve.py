@@ -46,8 +46,8 @@ from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.requests import OutputSection
 from magshell_fenicsx.quantities.mode_labels import TORSION
 from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import LOAD_FACTOR, shown_quantity
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import shown_quantity
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -75,6 +75,7 @@ def curve_figure(
     style: OutputSection,
     pole: str = POLE,
     errors: Mapping[str, float] | None = None,
+    load: str = "",
 ) -> "Figure":
     """Return the figure of the part of a path in which `amplitude` varied, with its branches.
 
@@ -93,13 +94,15 @@ def curve_figure(
     errors
         Estimated errors by the name of the result, as in summary.json; a band shows them where it
         is wider than the line.
+    load
+        The dead load at a load factor of 1, as text; empty if it is no single number.
     """
     panels = drawn_panels(rows, amplitude)
     with drawing(style):
         figure, cells = _figure_with_cells(panels, style)
         for cell, steps in zip(cells, panels, strict=True):
             axes = figure.add_subplot(cell)
-            plot_curve(axes, steps, pole)
+            plot_curve(axes, steps, pole, load)
             axes.set_title(curve_title(steps))
         legend(figure, max_columns=4 * min(len(panels), 2))
         place_axes(figure)  # for insets
@@ -224,15 +227,15 @@ def legend(figure: "Figure", max_columns: int) -> None:
         )
 
 
-def plot_curve(axes: "Axes", steps: Sequence[CurveStep], pole: str = POLE) -> None:
+def plot_curve(axes: "Axes", steps: Sequence[CurveStep], pole: str = POLE, load: str = "") -> None:
     """Draw steps of a path in given axes: curves, instabilities, solutions, numbers and labels.
 
     Several steps have arrows along their way. `pole` names the point of w_pole_over_h in a case
-    without named points.
+    without named points, `load` is the dead load at a load factor of 1.
     """
     amplitude, first_row = steps[0].amplitude, steps[0].rows[0]
     x_label, y_label = (
-        axis_label(axis_quantity, first_row, pole) for axis_quantity in axes_for(steps[0])
+        axis_label(axis_quantity, first_row, pole, load) for axis_quantity in axes_for(steps[0])
     )
     curves = [curve for step in steps for curve in draw_lines(axes, step)]
     rows = [row for step in steps for row in step.rows]
@@ -275,8 +278,10 @@ def plot_curve(axes: "Axes", steps: Sequence[CurveStep], pole: str = POLE) -> No
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
 
-def axis_label(axis_quantity: Quantity, row: Row, pole: str = POLE) -> str:
+def axis_label(axis_quantity: Quantity, row: Row, pole: str = POLE, load: str = "") -> str:
     """Return the label of an axis, with the unit of a time that has no seconds.
+
+    That of the load factor has the load at a factor of 1.
 
     Parameters
     ----------
@@ -286,7 +291,11 @@ def axis_label(axis_quantity: Quantity, row: Row, pole: str = POLE) -> str:
         A row of path.csv, which names the case's points.
     pole
         Name of the point of w_pole_over_h in a case without named points.
+    load
+        The dead load at a load factor of 1, as text; empty if it is no single number.
     """
+    if axis_quantity.name == LOAD_FACTOR and load:
+        return rf"{axis_quantity.label}  ($\times$ {load})"
     label = with_point_name(axis_quantity, row, pole, r"\$").label
     return rf"{label}  ($R\sqrt{{\rho/E}}$)" if axis_quantity.name == "time" else label
 

@@ -51,6 +51,7 @@ from magshell_fenicsx.output.store.manifest import refuse_unwritten, write_manif
 from magshell_fenicsx.output.store.stored_results import (
     case_in,
     headline,
+    load_at_factor_one,
     pole_of,
     read_summary,
     sizes_in,
@@ -320,7 +321,8 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     surface, shell_data = run.surface_at(run.headline)
     # over the load: the curve, and what sensors read
     if amplitude := str(last_row["amplitude"]):
-        curve = curve_figure(run.rows, amplitude, style, run.pole_name, run.errors)
+        load = load_at_factor_one(run.resolved, run.sizes)
+        curve = curve_figure(run.rows, amplitude, style, run.pole_name, run.errors, load)
         if shapes:
             with drawing(style):
                 shells = list[tuple[Row, Surface]]()

@@ -51,12 +51,18 @@ from magshell_fenicsx.output.pictures.lines import (
 )
 from magshell_fenicsx.output.pictures.rendering import near_outlines, near_solids, run_camera
 from magshell_fenicsx.output.pictures.scales import DISTANCE, SIGNED, colour_map, from_zero
-from magshell_fenicsx.output.store.stored_results import headline, pole_of, sizes_in, style_of
+from magshell_fenicsx.output.store.stored_results import (
+    headline,
+    load_at_factor_one,
+    pole_of,
+    sizes_in,
+    style_of,
+)
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows, varying_columns
 from magshell_fenicsx.platform.disk_cache import load_cached, save_cached
 from magshell_fenicsx.quantities.fields import FIELDS, in_case_unit_along_path
 from magshell_fenicsx.quantities.quantity import CaseSizes, Quantity
-from magshell_fenicsx.quantities.registry import amplitude, quantity, shown_quantity
+from magshell_fenicsx.quantities.registry import LOAD_FACTOR, amplitude, quantity, shown_quantity
 from magshell_fenicsx.shape.drawn_bodies import Solid
 
 Array = NDArray[np.float64]
@@ -227,7 +233,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {
-        **_path(rows, last_row, pole_of(case), arrays),
+        **_path(rows, last_row, pole_of(case), load_at_factor_one(case, case_sizes), arrays),
         # numbers of the rows that are frames, and the frame with which the page opens
         "frames": [rows.index(row) for row in frames],
         "opens": frames.index(headline_row) if headline_row in frames else len(frames) - 1,
@@ -325,7 +331,9 @@ def _has_numbers(column: str, rows: Sequence[Row]) -> bool:
     return not any(isinstance(value, str) or isnan(value) for value in values)
 
 
-def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[str, Any]:
+def _path(
+    rows: Sequence[Row], last: Row, pole: str, load: str, arrays: "_Packed"
+) -> dict[str, Any]:
     """Return the path for the page: varying columns of path.csv, labels and curves.
 
     Parameters
@@ -337,6 +345,8 @@ def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[
         curve.
     pole
         Words for the point of w_pole_over_h.
+    load
+        The dead load at a load factor of 1, as text.
     arrays
         Gets the slopes of the curves.
     """
@@ -357,7 +367,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str, arrays: "_Packed") -> dict[
         column_quantity = quantities.get(name) or quantity(name)
         values = [row[name] for row in rows]
         columns[name] = {
-            "label": label(column_quantity, rows[0], pole),
+            "label": label(column_quantity, rows[0], pole, load),
             "values": values,
             "sign": column_quantity.sign,
         }
@@ -458,7 +468,7 @@ def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]
     return [part for part in (*earlier_steps, *drawn_steps) if len(part.rows) > 1]
 
 
-def label(of_axis: Quantity, row: Row, pole: str) -> str:
+def label(of_axis: Quantity, row: Row, pole: str, load: str = "") -> str:
     """Return the label of an axis as HTML, with the words of curve.png.
 
     Parameters
@@ -469,7 +479,11 @@ def label(of_axis: Quantity, row: Row, pole: str) -> str:
         A row of path.csv, whose columns name the case's points and units.
     pole
         Words for the point of w_pole_over_h in a case without named points.
+    load
+        The dead load at a load factor of 1, as text.
     """
+    if of_axis.name == LOAD_FACTOR and load:
+        return f"{_html_label(of_axis)} (× {load})"
     return _html_label(with_point_name(of_axis, row, pole))
 
 

@@ -8,10 +8,11 @@ the point whose displacement the column w_pole_over_h has.
 
 import json
 from collections.abc import Mapping, Sequence
-from math import nan
+from math import isclose, isnan, nan
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from magshell_fenicsx.input.messages import explained
@@ -22,7 +23,7 @@ from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.parts.magnetism.fields import GROUPS as GROUPS_OF_FIELD
 from magshell_fenicsx.parts.shell_sections import FLAT_GEOMETRIES
 from magshell_fenicsx.problem.requests import OutputSection
-from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes
+from magshell_fenicsx.quantities.quantity import NO_UNITS, CaseSizes, with_prefix
 
 NUMBER_TYPES, NONE_TYPE = (int, float), type(None)
 PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
@@ -183,6 +184,43 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
         return _Options.model_validate(source.data).output
     except ValidationError as e:
         raise CaseError(explained(e.errors(), source, _Options)) from None
+
+
+LOAD_UNITS = {"force": "N", "moment": "N", "per_length": "N/m", "per_area": "Pa", "pressure": "Pa"}
+
+
+def load_at_factor_one(case: Mapping[str, Any], sizes: CaseSizes) -> str:
+    """Return the dead load of a case at a load factor of 1, with its unit, such as "50 mN".
+
+    Forces in one direction are added. Empty without units, for several lists of loads, and for
+    loads that are no single number.
+
+    Examples
+    --------
+    >>> loads = [{"at": "A", "force": [0, 0, -0.02]}, {"at": "B", "force": [0, 0, -0.03]}]
+    >>> sizes = CaseSizes(nu=0.5, R_over_h=100, R=0.01, E=1e6)
+    >>> load_at_factor_one({"loading": {"kind": "dead", "loads": loads}}, sizes)
+    '50 mN'
+    """
+    loading = case.get("loading") or {}
+    steps = loading if isinstance(loading, list) else [loading]
+    dead_steps = [step for step in steps if step.get("kind") == "dead"]
+    if len(dead_steps) != 1 or isnan(sizes.in_si):
+        return ""
+    # kind of each load, and its vector or number
+    loads = [
+        (kind, load[kind]) for load in dead_steps[0]["loads"] for kind in LOAD_UNITS if kind in load
+    ]
+    kinds = {kind for kind, _ in loads}
+    is_number = all(not isinstance(x, str) for _, load in loads for x in np.atleast_1d(load))
+    if not is_number or (len(loads) != 1 and kinds != {"force"}):
+        return ""
+    total = float(np.linalg.norm(np.sum([load for _, load in loads], axis=0)))
+    size = sum(float(np.linalg.norm(load)) for _, load in loads)
+    if not isclose(total, size, rel_tol=1e-9):  # in several directions
+        return ""
+    factor, unit = with_prefix(total, LOAD_UNITS[kinds.pop()])
+    return f"{factor * total:.4g} {unit}"
 
 
 def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
