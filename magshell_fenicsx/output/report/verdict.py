@@ -380,7 +380,7 @@ def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
 
     The sentence says how long the snap takes from a tenth to nine tenths of its way, with which
     damping that the run has added, after its departure from the fold, and how far it goes beyond
-    its end.
+    its end. A second one says what touches where it comes to rest.
     """
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
@@ -405,12 +405,33 @@ def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
     )
     jump, departure = times
     damping = _damping_of_snap(summary, lines)
-    return [Markup(words).format(jump, damping, departure, unit, overshoot)]
+    sentences = [Markup(words).format(jump, damping, departure, unit, overshoot)]
+    if touched := _touched_at_rest(summary, lines):
+        sentences.append(Markup("It comes to rest on {}.").format(" and ".join(touched)))
+    return sentences
+
+
+def _touched_at_rest(summary: Summary, lines: Sequence[Line]) -> list[str]:
+    """Return what touches where the first snap comes to rest, in words: bodies, and shells."""
+    rest = _line_at(summary["snaps"][0].get("rest"), lines)
+    case = summary.get("case", {})
+    columns = {f"{name}_normal_force": name for name in case.get("bodies") or {}}
+    columns["contact_force"] = "another shell" if case.get("shells") else "itself"
+    return [
+        name
+        for column, name in columns.items()
+        if above_rounding(float(rest.get(column) or 0.0)) > 0
+    ]
+
+
+def _line_at(point: int | None, lines: Sequence[Line]) -> Line:
+    """Return the line of the point with a number; empty if there is none."""
+    return next((line for line in lines if int(line["point"]) == point), {})
 
 
 def _damping_of_snap(summary: Summary, lines: Sequence[Line]) -> Markup:
     """Return words for the damping of the first snap, which slows it; empty if it is unknown."""
-    fold = next((line for line in lines if int(line["point"]) == summary["snaps"][0]["point"]), {})
+    fold = _line_at(summary["snaps"][0].get("point"), lines)
     loading = summary.get("case", {}).get("loading")
     steps = loading if isinstance(loading, list) else [loading]
     number_of_step = int(fold.get("step") or 0)
