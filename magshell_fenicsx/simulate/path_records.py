@@ -450,7 +450,9 @@ class _StageRecords:
         self._tiny_steps = [*earlier, point] if is_tiny else [point]
         if len(self._tiny_steps) != TINY_STEPS + 1 or not self._stage.scene.model.all_contacts:
             return ""
-        return creeping_remark(self._stage.scene)
+        remark = creeping_remark(self._stage.scene)
+        is_load_by_arc = run.path.control == "arc" and not run.path.name.startswith("approach")
+        return f"{remark}; or control: load" if is_load_by_arc else remark
 
     def _reason(self, path: Path, records_ahead: Sequence[Record]) -> str:
         """Return the reason why the path has stopped, in words; "" if it has reached its goal.
