@@ -7,7 +7,7 @@ that of the mid-surfaces less half of both thicknesses. h and R are thickness an
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
@@ -25,6 +25,7 @@ from magshell_fenicsx.shape.reference_shell import ReferenceShell
 
 Array = NDArray[np.float64]
 CONTACT_CELL_SIZE = 0.5  # over sqrt(R h), where shells come into contact
+BODY_CELL_SIZE = 0.7  # over sqrt(R h), where a rigid body is near: it may be near a whole shell
 CONTACT_REGION = 1.0  # over sqrt(R h): radius of the region with such cells
 ONE_PLACE_DISTANCE = 2.0  # over sqrt(R h): places no farther from each other are one
 GAP_TOLERANCE = 0.5  # over the thickness: places with so much larger a gap may meet as well
@@ -154,7 +155,8 @@ def body_zones(
         is_one_place = _extent(similar, middle) < ONE_PLACE_DISTANCE * sqrt(h)
         if is_one_place and gaps.min() < MAX_GAP * h:
             radius = section.blunt_radius / (R * pose.scale)
-            zones.append(ContactZone.at_place(middle, radius, h))
+            zone = ContactZone.at_place(middle, radius, h)
+            zones.append(replace(zone, ring_size=BODY_CELL_SIZE))
     return zones
 
 

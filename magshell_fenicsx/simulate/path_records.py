@@ -65,7 +65,7 @@ MAX_RATIO_TO_EXCLUDED = 2.0
 LOCATED = ("fold", "bifurcation")
 TINY_STEP = 1e-3  # over the way of a path
 TINY_STEPS = 15  # successive tiny steps after which a path in contact is said to creep
-RESOLVING_SIZE = 0.25  # of elements that resolve a contact, over sqrt(R h)
+RESOLVING_SIZE = 0.4  # of elements that resolve a contact, over sqrt(R h)
 MAX_CONTACT_CHANGES = 10  # times that a first point gets stiffer penalties or new cuts
 FIRST_STEP_REDUCTION = (
     1 / 16

@@ -195,11 +195,14 @@ class ContactZone:
         Radius of the zone.
     size
         Radius of the body's part that touches; infinite for a plane.
+    ring_size
+        Size of elements that show the ring of the contact, over sqrt(Rh).
     """
 
     place: Array
     reach: float
     size: float
+    ring_size: float = RING_SIZE
 
     @classmethod
     def of_body(
@@ -247,7 +250,7 @@ class ContactZone:
         x, y = map(float, self.place)
         ring_width, body_radius = sqrt(sizing.h), self.size
         # sizes of elements: those that resolve the ring, and those that resolve the body
-        ring_size = RING_SIZE * ring_width / sizing.refinement
+        ring_size = self.ring_size * ring_width / sizing.refinement
         features: list[Feature] = [
             DiscFeature((x, y), radius=self.reach, size=ring_size, growth=growth)
         ]
