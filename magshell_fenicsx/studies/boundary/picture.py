@@ -27,6 +27,7 @@ WORDS = {
     "meeting": "second mode neutral",
     "crossing": "another mode comes first",
 }
+DASHED = "other modes are unstable already"
 LEGEND: Mapping[str, Any] = {
     "frameon": False,
     "fontsize": 8,
@@ -59,7 +60,9 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
             _dashed_line(plot, smooth_part)
         plot.margins(y=0.3 if len(mode_parts) > 1 else None)
         _marks(plot, "load", rows)
-        for x, y, region_name in _regions(rows, content, plot.get_ylim()):
+        # from another instability of a run it is unknown on which side the shell is stable
+        regions = [] if content.get("start") else _regions(rows, content, plot.get_ylim())
+        for x, y, region_name in regions:
             plot.annotate(region_name, (x, y), ha="center", va="center", color="0.35")
         _shade_between_folds(plot, rows)
         plot.set(
@@ -92,7 +95,10 @@ def _dashed_line(plot: Any, rows: Sequence[Row]) -> None:
         intervals = [*group]
         first_end, _ = intervals[0]
         line = [first_end, *(second_end for _, second_end in intervals)]
-        _line(plot, line, color="C0", linestyle="--" if unstable else "-")
+        # a name for the first dashed line alone
+        is_first = unstable and DASHED not in plot.get_legend_handles_labels()[1]
+        label = DASHED if is_first else None
+        _line(plot, line, color="C0", linestyle="--" if unstable else "-", label=label)
 
 
 def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:

@@ -178,7 +178,7 @@ def boundary(
             comm,
             lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in directions},
         )
-        stability_boundary = _put_together(outcomes, begin, span, name, settings)
+        stability_boundary = _put_together(outcomes, begin, span, name, settings, begun_at.text)
         access_disk(comm, lambda: _write(stability_boundary, folder))
     for line in stability_boundary.content["said"]:
         say_on_first_rank(line)
@@ -504,6 +504,7 @@ def _put_together(
     span: VariedKey,
     name: str,
     settings: Sequence[str],
+    start: str,
 ) -> StabilityBoundary:
     """Join both directions of the boundary into one curve; return it with its description.
 
@@ -515,6 +516,8 @@ def _put_together(
         The instability at the start, with its `name_of_mode`.
     name
         Name of the case file.
+    start
+        Run and point at which the boundary starts, DIR:POINT; "" for the case's first instability.
     """
     # a direction is missing where the start is at that end of the range
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
@@ -529,6 +532,7 @@ def _put_together(
     content = {
         "case": name,
         "settings": list(settings),
+        "start": start,
         "key": span.key,
         "unit": span.unit,
         "from": span.first,
