@@ -332,6 +332,14 @@ def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:
         "no error estimate. For one: give the case mesh: {tolerance: 1e-3}"
         in page(tmp_path, [FOLD]).text
     )
+    tube = SUMMARY["case"] | {"shell": {"geometry": "cylinder"}}
+    assert "mesh.tolerance is not offered" not in page(tmp_path, [FOLD], case=tube).text
+    estimated = {"knockdown": 1.5e-4, "w_over_h@end": 2e-3}
+    reasons = {"limit_load_2": "it would take long"}
+    text = page(tmp_path, [FOLD], errors=estimated, errors_not_estimated=reasons).text
+    assert "no error estimate" not in text
+    assert "w_over_h@end0.002" in text
+    assert "Without an estimate: limit_load_2 (it would take long)" in text
 
 
 def test_a_flat_shell_has_no_classical_pressure(tmp_path: Path) -> None:
