@@ -74,7 +74,9 @@ def test_a_ring_around_a_touched_spot() -> None:
     peak = ContactPeak(pressure=1.0, line_force=3.0, force=8.0)
     surface = cast(Surface, SimpleNamespace(fields=fields, contact_peak=peak))
     assert [layer.name for layer in contact(surface)] == ["gap_over_h"]
-    assert "Its force per length is 3 $Eh$" in pressure_note(surface)
+    assert "Its force per length is at most 3 $Eh$" in pressure_note(surface)
+    surface.__dict__["contact_peak"] = replace(peak, is_median=True)
+    assert "Its force per length has the median 3 $Eh$" in pressure_note(surface)
 
 
 def test_the_images_of_a_line_are_one_line() -> None:
@@ -87,6 +89,14 @@ def test_the_images_of_a_line_are_one_line() -> None:
     assert len(whole.pressure) == 4 * len(x)
     assert _along_surface(whole, whole.pressure * whole.area) == pytest.approx(3, rel=0.05)
     assert {(px > 0) for px in whole.places[:, 0]} == {True, False}
+
+
+def test_points_along_a_fraction_of_a_cell_are_a_spot() -> None:
+    """Three spots of 0.1 of a cell, whose points lie on lines: the mesh makes them lines."""
+    x = np.concatenate([middle + np.linspace(-0.001, 0.001, 5) for middle in (0.0, 0.5, 1.0)])
+    row = np.full(len(x), 1.0)
+    spots = PressedPoints(np.column_stack([x, 0 * x, 0 * x]), row, row, 4e-4 * row)
+    assert np.isnan(_along_surface(spots, row))
 
 
 @pytest.mark.slow

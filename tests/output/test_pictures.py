@@ -342,6 +342,9 @@ def test_opposite_fields_are_opposite_arrows() -> None:
     across = first.feet - second.feet
     assert np.abs(across[:, 0]).max() < 1e-9
     assert (np.abs(across[:, 1]) > 0.01).all()
+    assert r"$F\,\hat B^\mathrm{r}$" in first.name
+    rotated, _ = field_arrows(replace(surface, remanence_rotates=True))
+    assert r"$R\,\hat B^\mathrm{r}$" in rotated.name
 
 
 def test_magnetic_loads_tell_what_is_zero() -> None:

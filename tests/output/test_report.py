@@ -332,6 +332,31 @@ def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:
         "no error estimate. For one: give the case mesh: {tolerance: 1e-3}"
         in page(tmp_path, [FOLD]).text
     )
+    tube = SUMMARY["case"] | {"shell": {"geometry": "cylinder"}}
+    assert "mesh.tolerance is not offered" not in page(tmp_path, [FOLD], case=tube).text
+    estimated = {"knockdown": 1.5e-4, "w_over_h@end": 2e-3}
+    reasons = {"limit_load_2": "it would take long"}
+    text = page(tmp_path, [FOLD], errors=estimated, errors_not_estimated=reasons).text
+    assert "no error estimate" not in text
+    assert "w_over_h@end0.002" in text
+    assert "Without an estimate: limit_load_2 (it would take long)" in text
+
+
+def test_estimate_names_the_result_at_a_target(tmp_path: Path) -> None:
+    """A run beyond its fold: the estimate is not that of k_d, which stands before it."""
+    target = {"label": "target", "amplitude": "pressure", "p_over_pc": 0.1, "w_pole_over_h": 9.0}
+    loading = {"kind": "pressure", "until": "target"}
+    case = SUMMARY["case"] | {"loading": loading}
+    tried = {"degree": 4, "refinement": 1.0, "cells": 76, "dofs": 610, "estimate": 2e-5}
+    sentence = "The estimated relative error of {} is 2 · 10−5."
+    named = {
+        0.1: "the pressure at the end",
+        7.5: "the displacement conjugate to the pressure at the end",
+    }
+    for result, words in named.items():
+        known = {"tolerance": 1e-4, "error_estimate": 2e-5, "rounds": [tried | {"result": result}]}
+        text = page(tmp_path, [FOLD, target], case=case, tolerance=known).text
+        assert sentence.format(words) in text
 
 
 def test_a_flat_shell_has_no_classical_pressure(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterator
+from html import unescape
 from math import pi, sqrt
 from pathlib import Path
 from typing import Any
@@ -218,7 +219,7 @@ def whole_report(folder: Path) -> int:
         for cell, power in zip(cells, powers, strict=True):
             if re.fullmatch(NUMBER, cell):
                 assert is_there(cell, known, power), (cell, power)
-    text = re.sub(r"<[^>]*>", " ", (head + rest).replace("10<sup>", "1e"))
+    text = unescape(re.sub(r"<[^>]*>", " ", (head + rest).replace("10<sup>", "1e")))
     found = re.findall(rf"(?<![\w.]){NUMBER}(?![\w.])", text)
     strange = [each for each in found if not is_there(each, summary | {2.0})]  # the two of 2πD/R
     assert not [each for each in strange if not is_there(each, set().union(*rows))]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 REACH_ALONG_LINE = 2.3  # square roots of a cell's area: some one and a half sides
+MIN_LENGTH_OF_LINE = 1.0  # square roots of a cell's area: a shorter contact is a spot
 MAX_WIDTH_OF_LINE = 0.5  # over its length
 MAX_SAMPLED_POINTS = 200  # around which the force per length is computed
 
@@ -42,6 +43,9 @@ class ContactPeak:
         Sum of all normal forces, of the whole shell, over E h R.
     pressure_error, force_error
         Estimated errors of `pressure` and `force` by the mesh, as parts of them; nan if unknown.
+    is_median
+        Whether `line_force` is the median of all places, of a surface; else it is the largest one,
+        of a meridian.
     """
 
     pressure: float
@@ -49,6 +53,7 @@ class ContactPeak:
     force: float
     pressure_error: float = nan
     force_error: float = nan
+    is_median: bool = False
 
 
 def contact_peak(
@@ -69,11 +74,13 @@ def contact_peak(
     if mirror:
         points = points.with_images(mirror)
     forces = points.pressure * points.area
-    along_line = _along_meridian if len(model.axes) == 2 else _along_surface
+    is_surface = len(model.axes) != 2
+    along_line = _along_surface if is_surface else _along_meridian
     return ContactPeak(
         pressure=float(points.pressure.max()),
         line_force=along_line(points, forces),
         force=float(forces.sum()),
+        is_median=is_surface,
     )
 
 
@@ -97,10 +104,15 @@ def _along_surface(points: PressedPoints, forces: Array) -> float:
     """Return the median of the forces per length around points; nan if most are in spots."""
     count = len(forces)
     sample = np.linspace(0, count - 1, min(count, MAX_SAMPLED_POINTS)).astype(int)
-    reach = REACH_ALONG_LINE * np.sqrt(points.cell_area[sample])
-    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(points.places[sample], reach)
+    cell_size = np.sqrt(points.cell_area[sample])
+    neighbours = scipy.spatial.cKDTree(points.places).query_ball_point(
+        points.places[sample], REACH_ALONG_LINE * cell_size
+    )
     forces_per_length = np.array(
-        [_per_length(points.places[indices], forces[indices]) for indices in neighbours]
+        [
+            _per_length(points.places[indices], forces[indices], MIN_LENGTH_OF_LINE * size)
+            for indices, size in zip(neighbours, cell_size, strict=True)
+        ]
     )
     is_line, weights = np.isfinite(forces_per_length), forces[sample]
     if weights[is_line].sum() < weights.sum() / 2:
@@ -111,15 +123,17 @@ def _along_surface(points: PressedPoints, forces: Array) -> float:
     return float(forces_per_length[is_line][order][middle])
 
 
-def _per_length(places: Array, forces: Array) -> float:
+def _per_length(places: Array, forces: Array, min_length: float) -> float:
     """Return the sum of forces (n,) at places (n, 3) over the length of their line; nan of a spot.
 
-    An even force on a straight line of the length L has the variance L²/12 along it.
+    A spot is nearly as wide as long, or shorter than `min_length`: the mesh does not show whether
+    it is a line. An even force on a straight line of the length L has the variance L²/12 along it.
     """
     from_middle = places - forces @ places / forces.sum()
     covariance = (forces[:, None] * from_middle).T @ from_middle / forces.sum()
     *_, second_variance, largest_variance = np.linalg.eigvalsh(covariance)
-    is_spot = second_variance > MAX_WIDTH_OF_LINE**2 * largest_variance
-    if is_spot or not largest_variance:
+    is_wide = second_variance > MAX_WIDTH_OF_LINE**2 * largest_variance
+    length = np.sqrt(12 * max(largest_variance, 0.0))
+    if is_wide or length < min_length:
         return nan
-    return float(forces.sum() / np.sqrt(12 * largest_variance))
+    return float(forces.sum() / length)

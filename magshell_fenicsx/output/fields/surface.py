@@ -103,6 +103,9 @@ class Surface:
         shells share are double.
     contact_peak
         Largest pressure and force per length of the contact; None without touch.
+    remanence_rotates
+        Whether the remanence turns with the material and does not stretch. Files of fields do not
+        say it: pictures have it from the case.
     """
 
     r0: Array
@@ -116,6 +119,7 @@ class Surface:
     solids: tuple[Solid, ...] = ()
     shells: tuple[str, ...] = ()
     contact_peak: ContactPeak | None = None
+    remanence_rotates: bool = False
 
     @property
     def is_body(self) -> bool:
@@ -585,6 +589,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         solids=surface.solids,
         shells=surface.shells,
         contact_peak=surface.contact_peak,
+        remanence_rotates=surface.remanence_rotates,
     )
 
 

@@ -45,6 +45,7 @@ VTK_TENSOR_INDICES = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])
 VTK_TENSOR_POSITIONS = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 JUMPS = ("moment_jump", "strain_jump")
 PEAK = "contact_peak"  # the fields of a `ContactPeak`, in their order
+PEAK_NUMBERS = 5  # of these, before `is_median`
 SHELLS = "shells"  # names of the shells, in the order of the numbers in `shell`
 DATA_OF_SURFACE = ("u", "u_over_h", "w_over_h", "r0", "n0")
 STRENGTH = quantity(FIELD.column).ascii_symbol  # of the applied field
@@ -260,9 +261,15 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
         jump=moment_jump,
         strain_jump=strain_jump,
         shells=_shell_names(grid.GetFieldData()),
-        contact_peak=ContactPeak(*map(float, file_arrays[PEAK])) if PEAK in file_arrays else None,
+        contact_peak=_contact_peak(file_arrays[PEAK]) if PEAK in file_arrays else None,
     )
     return surface, shell_data
+
+
+def _contact_peak(values: Array) -> ContactPeak:
+    """Return the numbers of a contact from those of a file; one of an earlier version has fewer."""
+    numbers, is_median = values[:PEAK_NUMBERS], values[PEAK_NUMBERS:].any()
+    return ContactPeak(*map(float, numbers), is_median=bool(is_median))
 
 
 def _have_nodes(cells: NDArray[Any], count: int) -> bool:

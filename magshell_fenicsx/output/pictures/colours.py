@@ -434,7 +434,8 @@ def _line_force_text(peak: ContactPeak, sizes: CaseSizes) -> str:
     if isnan(peak.line_force):
         return f"Its force is {_amount(peak.force, CONTACT_FORCE, sizes)}{error_text}."
     line_force = _amount(peak.line_force, MEMBRANE_FORCE, sizes)
-    return f"Its force per length is {line_force}{error_text}."
+    measure = "has the median" if peak.is_median else "is at most"
+    return f"Its force per length {measure} {line_force}{error_text}."
 
 
 def _amount(value: float, unit: Unit, sizes: CaseSizes) -> str:

@@ -466,6 +466,8 @@ FIELDS = {
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
     "J": ("C2", r"induced polarisation $\mu_0 M$"),
 }
+# of a remanence that turns with the material and does not stretch
+ROTATED_REMANENCE = FIELDS["Br"][0], FIELDS["Br"][1].replace("$F", "$R")
 
 
 def field_arrows(
@@ -491,8 +493,9 @@ def field_arrows(
         for name in FIELDS.keys() & surface.fields
     }
     names = [name for name in FIELDS if name in lengths and lengths[name].max() > 0]
+    legend = FIELDS | ({"Br": ROTATED_REMANENCE} if surface.remanence_rotates else {})
     if camera is None or visible is None:  # only to ask which fields there are
-        return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in names)
+        return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *legend[name]) for name in names)
     # nodes at which arrows begin, and all of their arrows in the projection
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
@@ -511,7 +514,7 @@ def field_arrows(
     for name, sign in zip(names, (1, -1, 0), strict=False):
         is_long = lengths[name][feet] > MIN_ARROW * lengths[name].max()
         arrow_feet = (places + sign * offsets)[is_long]
-        arrows.append(Arrow(arrow_feet, vectors[name][is_long], *FIELDS[name]))
+        arrows.append(Arrow(arrow_feet, vectors[name][is_long], *legend[name]))
     return tuple(arrows)
 
 

@@ -137,7 +137,10 @@ class PicturedRun:
         """Return the whole deformed shell at a point, and the shell's data."""
         number = int(row["point"])
         if number not in self._points:
-            self._points[number] = read_point(self.folder / "fields", number)
+            surface, shell_data = read_point(self.folder / "fields", number)
+            magnetic = self.resolved.get("magnetic") or {}
+            rotates = magnetic.get("remanence") == "rotation"
+            self._points[number] = replace(surface, remanence_rotates=rotates), shell_data
         return self._points[number]
 
     def maps_at(self, row: Row) -> list[tuple[MapGrid, float]]:

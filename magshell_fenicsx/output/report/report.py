@@ -172,6 +172,9 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "sensitive": parameter,
         "gradients": gradients,
         "how_to_estimate": _how_to_estimate(case),
+        "errors": summary.get("errors", {}),
+        "errors_not_estimated": summary.get("errors_not_estimated", {}),
+        "errors_folded": len(summary.get("errors", {})) >= MIN_FOLDED_ROWS,
         "path": path,
         "rows": list(zip(*(column.cells for column in path), strict=True)),
         "folded": len(lines) >= MIN_FOLDED_ROWS,
@@ -352,10 +355,7 @@ def _how_to_estimate(case: dict[str, Any]) -> str:
         if shell_of(case)["geometry"] == "mesh"
         else "mesh.refinement twice as large"
     )
-    return (
-        f"run it again with {finer} and compare "
-        "(mesh.tolerance is not offered for this geometry or model)"
-    )
+    return f"run it again with {finer} and compare"
 
 
 def report_of(folder: Path) -> Path:

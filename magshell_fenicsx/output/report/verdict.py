@@ -46,6 +46,7 @@ END = "@end"  # what the name of a column at the last point ends with
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
 # degrees: a dimple at the pole is deepest on a ring as small as this, at no azimuth
 NEAR_POLE = 5.0
+SAME_RESULT_TOLERANCE = 1e-5  # relative, of a result of adaptive rounds and that of the run
 EQUAL_COLUMNS_TOLERANCE = 1e-9  # relative and absolute
 
 
@@ -362,7 +363,7 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
     sentences += _snaps(summary, lines)
-    sentences += _error(summary)
+    sentences += _error(summary, lines)
     sentences += [
         Markup("{}.").format(remark[0].upper() + remark[1:])
         for remark in summary.get("remarks", [])
@@ -443,7 +444,7 @@ def _damping_of_snap(summary: Summary, lines: Sequence[Line]) -> Markup:
     return Markup(" with the damping {} of snap").format(number(section["damping"]))
 
 
-def _error(summary: Summary) -> list[Markup]:
+def _error(summary: Summary, lines: Sequence[Line]) -> list[Markup]:
     """Return a list with one sentence on the estimated error; empty for a run without a tolerance.
 
     If another mesh of the adaptive rounds had a smaller estimate, the sentence names that too.
@@ -452,8 +453,8 @@ def _error(summary: Summary) -> list[Markup]:
     if (estimate := tolerance.get("error_estimate")) is None:
         return []
     best = tolerance.get("best")  # the round of meshes with the smallest estimate
-    sentence = Markup("The estimated relative error of the result is {}").format(
-        number(estimate, digits=2)
+    sentence = Markup("The estimated relative error of {} is {}").format(
+        _result_of_rounds(summary, lines), number(estimate, digits=2)
     )
     # `best` is the round with the smallest estimate
     if best and best["error_estimate"] < estimate:
@@ -466,6 +467,35 @@ def _error(summary: Summary) -> list[Markup]:
             number(on_branch, digits=2)
         )
     return [sentence + "."]
+
+
+def _result_of_rounds(summary: Summary, lines: Sequence[Line]) -> str:
+    """Return words for the result that the adaptive rounds compare.
+
+    At an instability it is the load there. At a target it is the load, or the displacement that is
+    conjugate to it, on which it does work.
+    """
+    loading = summary["case"].get("loading") or {}
+    last_step = (loading[-1] or {}) if isinstance(loading, list) else loading
+    on_path = [line for line in lines if line["branch"] == "0" and line["amplitude"]]
+    ends = [line for line in on_path if line["label"] not in LOCATED]
+    to_target = last_step.get("until", "target") in ("target", "points", "zero")
+    if not ends or not to_target or summary["stopped"]:
+        return "the result"
+    results = [each["result"] for each in summary["tolerance"]["rounds"]]
+
+    def is_result(line: Line) -> bool:
+        """Whether a round of meshes has the load of a line as its result."""
+        load = float(line.get(amplitude(line["amplitude"]).column) or math.nan)
+        return any(isclose(load, result, rel_tol=SAME_RESULT_TOLERANCE) for result in results)
+
+    load_at_end = amplitude(ends[-1]["amplitude"])
+    words = quantity(load_at_end.column).words
+    if is_result(ends[-1]):
+        return f"the {words} at the end"
+    if any(is_result(line) for line in located(on_path)):  # where the run goes over to a branch
+        return "the load at the instability"
+    return f"the displacement conjugate to the {words} at the end"
 
 
 def _barrier(summary: Summary) -> Markup:
