@@ -95,6 +95,17 @@ MISTAKES = [
             "as target; control: arc"
         ),
     ),
+    # the words of a key that a kind or a law has are not cut at the colon of the kind
+    (
+        "joints=[{edges: [a.rim, b.rim], kind: spring, stiffness: 1 N, angle: 60 deg}]",
+        "angle: '60 deg': must be a valid number (the angle at which it rests, in degree)",
+    ),
+    (
+        "shell.mu=30 kPa",
+        "must be a list, in brackets (the modulus of each term (neo-Hookean takes youngs_modulus "
+        "E = 3 mu))",
+    ),
+    ("shell.mooney=soft", "(C01/C10 of law: mooney-rivlin)"),
     # a missing key of a law is not a misplaced one
     ("shell.law=mooney-rivlin", "cap.yaml:1: shell: law: mooney-rivlin needs mooney"),
     ("shell.law=ogden", "cap.yaml:1: shell: law: ogden needs mu and alpha"),
