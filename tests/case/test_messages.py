@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 
 CAP = """\
@@ -127,6 +128,21 @@ def test_one_clear_message(file: Path, setting: str, said: str) -> None:
     (line,) = str(error.value).splitlines()
     assert said in line
     assert "function-" not in line  # pydantic's own names
+
+
+@pytest.mark.parametrize(
+    ("magnetic", "key"),
+    [
+        ("{lambda_m: 0}", "magnetic.lambda_m"),
+        (
+            "{remanent: {flux_density: 60 mT}, applied: {flux_density: 0 mT}}",
+            "magnetic.applied.flux_density",
+        ),
+    ],
+)
+def test_a_field_of_zero_names_its_key(file: Path, magnetic: str, key: str) -> None:
+    with pytest.raises(CaseError, match=f"loading.kind: field needs {key}, not zero"):
+        make_problem(Case.load(file, [f"magnetic={magnetic}", "loading={kind: field}"]))
 
 
 @pytest.mark.parametrize(
