@@ -334,7 +334,9 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     section, field = _section_at(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
     description = " ".join(description.split())  # of several lines of a docstring
-    words, *_ = re.split(r"[;:.,] | \[", description)
+    # without what has the key, as "Of kind: spring: "; the colon of a kind ends no words
+    description = re.sub(r"^Of (\w+: [\w-]+[:,]|a \w+:) ", "", description)
+    words, *_ = re.split(r"[;.,] | \[|(?<!kind)(?<!law)(?<!until)(?<!model): ", description)
     if not words:
         return ""
     unit = re.search(r"\[([^\[\]]+)\]$", description)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Loaded = tuple[Array, Sequence[Step]]  # place in the chart, and the loads there
-SOLID_DEGREE = 2
+SOLID_DEGREE, MAX_DEGREE = 2, 5
 MAX_SIZE = 0.35  # over R, where nothing needs smaller elements
 UNIFORM_SIZE = 2.0  # over sqrt(Rh): of a mesh with equal elements, and the largest of grids
 MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH = 0.25, 0.5  # of flat shells: over R, and over the width
@@ -48,7 +48,7 @@ class MeshSection(Section):
     """The elements: C0 interior penalty on triangles, graded towards dimple, load and held
     edges."""
 
-    degree: int = Field(default=4, ge=2, le=5)
+    degree: int = Field(default=4, ge=2, le=MAX_DEGREE)
     """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""

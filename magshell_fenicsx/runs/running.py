@@ -37,8 +37,10 @@ from magshell_fenicsx.output.store.manifest import MESH
 from magshell_fenicsx.output.store.run_identity import empty_checkpoint
 from magshell_fenicsx.output.store.stored_results import pole_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, pole_name
+from magshell_fenicsx.parts.supports.boundary import edges_of_inflated_rubber
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.platform.terminal import LINE_COLUMNS, fit_to_columns, is_plain_output
+from magshell_fenicsx.problem.mesh_sizes import MAX_DEGREE
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import format_number
 from magshell_fenicsx.quantities.registry import amplitude, field_columns, shown_quantity
@@ -515,10 +517,22 @@ def _estimate_errors(result: Result, output: RunOutput) -> None:
         output.say(LARGE_ERROR_WARNING.format(name, 100 * error))
     estimates = result.error_estimates
     for name in estimates.too_coarse:
-        way_on = "compare with a larger mesh.refinement"
-        if result.scene.problem.mesh.tolerance is None:
-            way_on = "mesh.tolerance, such as 1e-3, finds a mesh and gives one; or " + way_on
+        way_on = _way_to_estimate(result.scene.problem)
         output.say(f"warning: no estimated error of {name}: {estimates.reasons[name]}: {way_on}")
+
+
+def _way_to_estimate(problem: Problem) -> str:
+    """Return what gives an estimated error where the mesh of a run may be too coarse, in words."""
+    mesh = problem.mesh
+    way_on = "compare with a larger mesh.refinement"
+    if mesh.tolerance is None:
+        way_on = "mesh.tolerance, such as 1e-3, finds a mesh and gives one; or " + way_on
+    # the cells at a clamped edge of inflated rubber have one size, whatever the refinement
+    if edges_of_inflated_rubber(problem.context) and mesh.degree < MAX_DEGREE:
+        way_on = f"give mesh.degree: {mesh.degree + 1}"
+        if mesh.tolerance is not None:
+            way_on += " in place of mesh.tolerance"
+    return way_on
 
 
 def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:

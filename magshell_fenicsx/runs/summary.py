@@ -61,7 +61,9 @@ def _numbers_in(rows: Sequence[Row], column: str) -> NDArray[np.float64]:
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the motions of a path that begin at a fold and end at rest (`then: snap`).
+    """Return the motions of a path from an instability to rest (`then: snap`).
+
+    They begin at a fold; or in the row behind a bifurcation, in the model that has its mode.
 
     Returns
     -------
@@ -69,27 +71,29 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         For each snap: `point` and `rest`, the numbers of the rows where it begins and ends; times
         in the unit of the column time; `overshoot` and `dissipated`. `time` is from the release
         until half of the way of the deflection. `departure` is until a tenth of the way; it grows
-        without limit as the push at the fold vanishes. `jump` is from there until nine tenths.
+        without limit as the push there vanishes. `jump` is from there until nine tenths.
         `overshoot` is the largest deflection beyond the last, over the way. `dissipated` is the
         energy over E h R^2.
     """
     motions = []
-    for i, fold in enumerate(rows[:-1]):
-        if fold["label"] != "fold" or rows[i + 1]["amplitude"] != "time":
+    for i, start in enumerate(rows[:-1]):
+        is_behind_bifurcation = i > 0 and rows[i - 1]["label"] == "bifurcation"
+        is_released = start["amplitude"] != "time" and rows[i + 1]["amplitude"] == "time"
+        if not is_released or not (start["label"] == "fold" or is_behind_bifurcation):
             continue
-        # rows of the motion, from the fold to the equilibrium at rest
-        moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
-        if moving[-1]["label"] != "target":
-            continue  # it has not come to rest
+        # rows of the motion, from the instability to the equilibrium at rest
+        moving = [start, *(row for row in rows[i + 1 :] if row["step"] == start["step"])]
+        if len(moving) == 1 or moving[-1]["label"] != "target":
+            continue  # the motion is that of the next step, or has not come to rest
         t, w, dissipated = (_numbers_in(moving, key) for key in ("time", "w_over_h", "dissipated"))
-        # times since the fold at three parts of the way of the deflection. The last two rows are of
-        # one time: the end of the motion, and the equilibrium at rest, which is left out.
+        # times since the release at three parts of the way of the deflection. The last two rows are
+        # of one time: the end of the motion, and the equilibrium at rest, which is left out.
         part_of_way = (w - w[0]) / (w[-1] - w[0])
         departure, half_time, end_of_jump = (
             _first_at(fraction, t[:-1], part_of_way[:-1]) - t[0]
             for fraction in (JUMP_BEGINS, 0.5, JUMP_ENDS)
         )
-        rows_of_ends = {"point": fold["point"], "rest": moving[-1]["point"]}
+        rows_of_ends = {"point": start["point"], "rest": moving[-1]["point"]}
         times = {"time": half_time, "departure": departure, "jump": end_of_jump - departure}
         motions.append(
             {

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 
 CAP = """\
@@ -95,6 +96,17 @@ MISTAKES = [
             "as target; control: arc"
         ),
     ),
+    # the words of a key that a kind or a law has are not cut at the colon of the kind
+    (
+        "joints=[{edges: [a.rim, b.rim], kind: spring, stiffness: 1 N, angle: 60 deg}]",
+        "angle: '60 deg': must be a valid number (the angle at which it rests, in degree)",
+    ),
+    (
+        "shell.mu=30 kPa",
+        "must be a list, in brackets (the modulus of each term (neo-Hookean takes youngs_modulus "
+        "E = 3 mu))",
+    ),
+    ("shell.mooney=soft", "(C01/C10 of law: mooney-rivlin)"),
     # a missing key of a law is not a misplaced one
     ("shell.law=mooney-rivlin", "cap.yaml:1: shell: law: mooney-rivlin needs mooney"),
     ("shell.law=ogden", "cap.yaml:1: shell: law: ogden needs mu and alpha"),
@@ -116,6 +128,21 @@ def test_one_clear_message(file: Path, setting: str, said: str) -> None:
     (line,) = str(error.value).splitlines()
     assert said in line
     assert "function-" not in line  # pydantic's own names
+
+
+@pytest.mark.parametrize(
+    ("magnetic", "key"),
+    [
+        ("{lambda_m: 0}", "magnetic.lambda_m"),
+        (
+            "{remanent: {flux_density: 60 mT}, applied: {flux_density: 0 mT}}",
+            "magnetic.applied.flux_density",
+        ),
+    ],
+)
+def test_a_field_of_zero_names_its_key(file: Path, magnetic: str, key: str) -> None:
+    with pytest.raises(CaseError, match=f"loading.kind: field needs {key}, not zero"):
+        make_problem(Case.load(file, [f"magnetic={magnetic}", "loading={kind: field}"]))
 
 
 @pytest.mark.parametrize(

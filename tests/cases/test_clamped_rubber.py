@@ -15,6 +15,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.axisymmetric.meridian import with_cell_at_edge
 from magshell_fenicsx.public import run
+from magshell_fenicsx.runs.running import _way_to_estimate
 
 RUBBER = {"poisson_ratio": 0.5, "law": "neo-hookean"}
 MODELS: list[Mapping[str, Any]] = [
@@ -88,6 +89,23 @@ def test_warning_of_the_layer(rim: str, law: Mapping[str, Any], warned: bool) ->
     warnings = make_problem(Case.from_source(case)).warnings
     layer = "boundary.rim: clamped: blown-up rubber bends there in a layer"
     assert any(warning.startswith(layer) for warning in warnings) == warned
+
+
+@pytest.mark.parametrize(
+    ("rim", "mesh", "way_on"),
+    [
+        ("clamped", {}, "give mesh.degree: 5"),
+        ("clamped", {"tolerance": 1e-3}, "give mesh.degree: 5 in place of mesh.tolerance"),
+        ("clamped", {"degree": 5}, "mesh.tolerance, such as 1e-3, finds a mesh and gives one; or "),
+        ("hinged", {}, "mesh.tolerance, such as 1e-3, finds a mesh and gives one; or "),
+    ],
+)
+def test_way_to_an_estimated_error(rim: str, mesh: Mapping[str, Any], way_on: str) -> None:
+    """Where the refinement leaves the cells at the rim as they are, a higher degree is named."""
+    shell = {"geometry": "disc", "radius_to_thickness": 50} | RUBBER
+    loading = {"kind": "pressure", "control": "arc", "until": "limit"}
+    case = {"shell": shell, "boundary": {"rim": rim}, "loading": loading, "mesh": mesh}
+    assert _way_to_estimate(make_problem(Case.from_source(case))).startswith(way_on)
 
 
 def test_warning_of_the_layer_of_several_shells() -> None:

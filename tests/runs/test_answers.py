@@ -249,11 +249,14 @@ def test_creeping_contact_is_told() -> None:
     records._stage = SimpleNamespace(scene=scene)  # type: ignore[assignment]
     steps = [0, 1, *(1 + 1e-6 * np.arange(1, 2 * TINY_STEPS))]
 
-    def said_on(steps: Sequence[float], control: str, *targets: float) -> list[str]:
+    def said_on(
+        steps: Sequence[float], control: str, *targets: float, name: str = "approach_plate"
+    ) -> list[str]:
         """What is said at each of these values of s."""
         records._tiny_steps = []
         points = [SimpleNamespace(s=s) for s in steps]
-        path, goal = SimpleNamespace(control=control), SimpleNamespace(targets=targets)
+        path = SimpleNamespace(control=control, name=name)
+        goal = SimpleNamespace(targets=targets)
         course = SimpleNamespace(points=points, path=path, goal=goal)
         return [
             records._remark_on_tiny_steps(course, point)  # type: ignore[arg-type]
@@ -267,5 +270,9 @@ def test_creeping_contact_is_told() -> None:
     assert [bool(text) for text in said].index(True) == 1 + TINY_STEPS
     size = 0.25 * np.sqrt(30 * 0.5)
     assert [text for text in said if text] == [creeping_remark(scene)]
+    said_of_a_load = said_on(steps, "arc", name="pressure")
+    assert [text for text in said_of_a_load if text] == [
+        f"{creeping_remark(scene)}; or control: load"
+    ]
     assert creeping_remark(scene).endswith(f"mesh.size: {size:.2g} mm")
     assert creeping_remark(Scene(Case.from_source(data))).endswith("mesh.refinement: 1.4")

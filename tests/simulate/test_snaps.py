@@ -187,3 +187,24 @@ def test_departure_and_jump(late: float) -> None:
     touching = {"bodies": {"ball": {}}, "shells": {"upper": {}, "lower": {}}}
     *_, touched = _snaps({"snaps": [snap], "case": touching}, lines)
     assert touched == "It comes to rest on another shell."
+
+
+def test_a_snap_from_a_bifurcation() -> None:
+    """It begins in the row behind the bifurcation; a motion that is a step of its own is none."""
+    t = np.append(np.linspace(0, 10, 21), 10)
+    columns = {"step": 2, "amplitude": "time", "dissipated": 0.0, "label": "step"}
+    motion = [
+        {**columns, "point": i, "time": at, "w_over_h": at}  # at a constant speed
+        for i, at in enumerate(t, 1)
+    ]
+    motion[0] |= {"amplitude": "load"}  # in the model that has the mode
+    motion[-1] |= {"label": "target"}
+    table = [motion[0] | {"point": 0, "label": "bifurcation"}, *motion]
+    (snap,) = snaps(table)
+    assert (snap["point"], snap["rest"]) == (1, 22)
+    assert snap["jump"] == pytest.approx(8.0)
+    (said,) = _snaps({"snaps": [snap]}, [{"point": "1", "label": "step"}])
+    assert "after a departure from the bifurcation of 1 " in said
+    table[:2] = [row | {"step": 1} for row in table[:2]]
+    table[1] |= {"label": "target"}
+    assert snaps(table) == []

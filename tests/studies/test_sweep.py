@@ -272,6 +272,8 @@ def test_a_frequency_at_the_end_of_each_point(tmp_path: Path) -> None:
     done = sweep(PLATE, over, still, tmp_path, result="omega2_1@end")
     for ratio, found in zip((50, 100), done.results, strict=True):
         assert found == pytest.approx(10.2158**2 / (12 * (1 - 0.3**2) * ratio**2), rel=5e-3)
+    for row in read(tmp_path / "sweep.csv"):
+        assert row["errors_not_estimated"] == f"omega2_1@end: {chains.FREQUENCY_NOT_ESTIMATED}"
     again = sweep(PLATE, over, still, tmp_path, result="omega2_1@end")
     assert again.results == done.results
     with pytest.raises(CaseError, match=r"hertz_1: needs shell\.density"):

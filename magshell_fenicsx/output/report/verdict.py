@@ -380,8 +380,8 @@ def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
     """Return a list with one sentence on the first snap; empty without a snap.
 
     The sentence says how long the snap takes from a tenth to nine tenths of its way, with which
-    damping that the run has added, after its departure from the fold, and how far it goes beyond
-    its end. A second one says what touches where it comes to rest.
+    damping that the run has added, after its departure from the instability, and how far it goes
+    beyond its end. A second one says what touches where it comes to rest.
     """
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
@@ -402,11 +402,13 @@ def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
     if percent > MIN_OVERSHOOT:
         overshoot = Markup(", and overshoots by {} % of its way").format(number(percent, digits=2))
     words = (
-        "The snap takes {} from 10 to 90 % of its way{}, after a departure from the fold of {}{}{}."
+        "The snap takes {} from 10 to 90 % of its way{}, after a departure from the {} of {}{}{}."
     )
     jump, departure = times
+    start = _line_at(snaps[0].get("point"), lines)
+    instability = "fold" if start.get("label", "fold") == "fold" else "bifurcation"
     damping = _damping_of_snap(summary, lines)
-    sentences = [Markup(words).format(jump, damping, departure, unit, overshoot)]
+    sentences = [Markup(words).format(jump, damping, instability, departure, unit, overshoot)]
     if touched := _touched_at_rest(summary, lines):
         sentences.append(Markup("It comes to rest on {}.").format(" and ".join(touched)))
     return sentences

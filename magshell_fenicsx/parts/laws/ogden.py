@@ -146,8 +146,9 @@ class OgdenSection(LawSection):
 
     law: Literal["ogden"]
     mu: list[float] = Field(min_length=1, max_length=6)
-    """Of law: ogden, of each term of its energy mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3); only
-    their ratios count, for E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
+    """Of law: ogden, the modulus of each term (neo-Hookean takes youngs_modulus E = 3 mu); the
+    energy of a term is mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3). Only their ratios count, for
+    E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
     alpha: list[Exponent] = Field(min_length=1, max_length=6)
     """Of law: ogden, the exponent of each term, with the sign of its mu"""
 

@@ -136,9 +136,11 @@ class FieldSection(FactorStep):
     def refuse_unfit(self, context: Context) -> None:
         """Refuse a step without a field."""
         if not strength(context):
+            magnetic = context.section_of(MagneticSection)
+            in_tesla = magnetic is not None and magnetic.lambda_m is None
+            key = "magnetic.applied.flux_density" if in_tesla else "magnetic.lambda_m"
             raise ValueError(
-                f"{context.step.key}.kind: field needs magnetic.lambda_m, not zero, for its "
-                "target or direction"
+                f"{context.step.key}.kind: field needs {key}, not zero, for its target or direction"
             )
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:

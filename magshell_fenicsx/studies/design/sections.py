@@ -134,7 +134,8 @@ class RemanenceVariables(Section):
     filter: float | None = Field(default=None, gt=0, le=10)
     """Nothing varies over less than this; by default the distance of the points [R]"""
     magnitude: Bounds | None = None
-    """Least and largest length of a vector; by default lengths stay as they are [|B^r|]"""
+    """Least and largest length of a vector, 0 < least < largest <= 1; by default lengths stay as
+    they are [|B^r|]"""
     steps: Annotated[int, Field(ge=2, le=360)] | None = None
     """At the end polar angles (and azimuths) are rounded to the nearest of so many steps of a turn
     """

@@ -25,6 +25,7 @@ from magshell_fenicsx.studies.points import Axis, Case, SweepPoint, last_numeric
 
 # a model with an earlier one of these symmetries can show what a model with a later one does
 SYMMETRIES = "none", "half", "axisymmetric"
+FREQUENCY_NOT_ESTIMATED = "a run with a section frequencies estimates its error, and no sweep"
 MOST_UNKNOWNS = 200_000  # of the scenes that are kept: 1 GB with their factors
 
 
@@ -266,6 +267,7 @@ def _by_path(
     outcome = outcome_of(result, "path", work, wall_s, folds.columns, estimates)
     if folds.frequency:
         outcome.curve[result.end] |= _frequency_at_end(result, folds.frequency)
+        outcome.errors_not_estimated[f"{folds.frequency}@end"] = FREQUENCY_NOT_ESTIMATED
     return outcome, continuation
 
 
