@@ -268,8 +268,8 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
 
 def _contact_peak(values: Array) -> ContactPeak:
     """Return the numbers of a contact from those of a file; one of an earlier version has fewer."""
-    numbers, is_median = values[:PEAK_NUMBERS], values[PEAK_NUMBERS:].any()
-    return ContactPeak(*map(float, numbers), is_median=bool(is_median))
+    peak = ContactPeak(*map(float, values[:PEAK_NUMBERS]))
+    return replace(peak, is_median=bool(values[PEAK_NUMBERS:].any()))
 
 
 def _have_nodes(cells: NDArray[Any], count: int) -> bool:
