@@ -6,7 +6,7 @@ Lengths are over R, pressures over E h/R, forces over E h R. On a meridian point
 and each stands for a ring.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import nan
 from typing import TYPE_CHECKING
 
@@ -53,7 +53,7 @@ class ContactPeak:
     force: float
     pressure_error: float = nan
     force_error: float = nan
-    is_median: bool = False
+    is_median: bool = field(default=False, kw_only=True)
 
 
 def contact_peak(
