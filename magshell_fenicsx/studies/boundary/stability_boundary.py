@@ -136,7 +136,7 @@ def boundary(
     """
     span = parse_range(over)
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
-    begun_at, source = on_first_rank(comm, lambda: start_from(start, source))
+    begun_at, source = on_first_rank(comm, lambda: start_from(start, source, make_case))
     # the case of another run takes the place of the file, and so of its settings
     for setting in settings if start else ():
         override(source, setting)

@@ -12,8 +12,6 @@ from math import isclose
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.stored_results import case_in
@@ -21,6 +19,7 @@ from magshell_fenicsx.output.store.table import LOCATED, read_rows
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene_family import NoInstability, first_instability
+from magshell_fenicsx.studies.points import MakeCase
 
 LOAD_TOLERANCE = 1e-3  # of a load: the run and its repetition, on another processor
 FORM = (
@@ -90,7 +89,7 @@ def _load(record: Record) -> float:
     return float(record.point.state.mu.get(record.amplitude, 0.0))
 
 
-def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
+def start_from(text: str | None, source: Source, make_case: MakeCase) -> tuple[Start, Source]:
     """Read `--from`: return the instability, and the case of its run in place of a case.
 
     Without a text the case is unchanged, and the instability is the first of the last step.
@@ -125,7 +124,8 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
     # the amplitude that varies there
     load = float(row[amplitude(row["amplitude"]).column])
     # places in the file, for messages, are not those of the stored case
-    data = with_texts(data, document_of(Case.from_source(source)).data, source.data)
+    resolved = make_case(source).model_dump(mode="json", exclude_none=True)
+    data = with_texts(data, resolved, source.data)
     return Start(text, point, load), replace(source, data=data, places={})
 
 
