@@ -163,10 +163,11 @@ class Case(WithParts):
     moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] | Waves = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of
-    a mirror plane that shape, supports, fields and load share (half), the meridian of what is
-    closed around e3 and has an edge, or those of several such shells (axisymmetric), or for a
-    number m the sector of 180/m degrees between two mirror planes through e3, which waves cos(mφ)
-    have, of what is closed around e3, of several such shells and of mesh files; 1 is a half"""
+    a mirror plane that shape, supports, fields and load share (half; each of several shells is its
+    own image in it), the meridian of what is closed around e3 and has an edge, or those of several
+    such shells (axisymmetric), or for a number m the sector of 180/m degrees between two mirror
+    planes through e3, which waves cos(mφ) have, of what is closed around e3, of several such shells
+    and of mesh files; 1 is a half"""
 
     _several: SeveralShells | None = PrivateAttr(default=None)
 

@@ -709,8 +709,8 @@ class ContinuationGoal:
     Attributes
     ----------
     until
-        "limit": at the first instability, or at the last target; "bifurcation": at the first
-        bifurcation, through folds; "target": at the last target; "points": after `steps` steps.
+        "limit": at the first instability; "bifurcation": at the first bifurcation, through folds;
+        both at the last target at the latest; "target": there; "points": after `steps` steps.
     targets
         Requested points: values of s or, on a path by arc length, of `quantity`.
     quantity
@@ -982,7 +982,7 @@ class ContinuationRun:
             The points from which the end of the step is extrapolated.
         """
         goal = self.goal
-        ends_at_target = bool(goal.targets) and goal.until in ("target", "limit")
+        ends_at_target = bool(goal.targets) and goal.until != "points"
         if self._by_arc and ends_at_target:
             return end_near_last_target(self.path, goal.quantity, goal.targets[-1], s, predictors)
         return s
@@ -1022,7 +1022,7 @@ class ContinuationRun:
                 break
         if self._by_arc and self.goal.targets:
             folds = [point for label, point, _ in events if label == "fold" and point.s != low.s]
-            ends_run = self.goal.until in ("target", "limit")
+            ends_run = self.goal.until != "points"
             for target, point in self._targets_around(low, folds, high):
                 events.append(("target", point, ends_run and target == self.goal.targets[-1]))
         return sorted(events, key=lambda event: abs(event[1].s - low.s))

@@ -57,12 +57,12 @@ class PathStep(Step):
     points: Count = 10
     then: Literal["snap", "follow"] | None = None
     """What follows the instability that ends the step. `snap`, with `until: limit` or
-    `bifurcation`: the shell is released, and moves under its loads and what else is held, lightly
-    damped, until it rests on the branch that it snaps to. `follow`, with `until: bifurcation`: the
-    branch that begins there is followed, to a target that may stand here, or for `points` steps. A
-    mode that a meridian or a half excludes takes the smallest model that has it: for m waves the
-    sector of 180/m degrees between two mirror planes, else a half, else the whole shell. The next
-    step goes on from there, in that model"""
+    `bifurcation`: the shell is released, and moves under its loads and what else is held, damped as
+    `snap` says, until it rests on the branch that it snaps to. `follow`, with `until: bifurcation`:
+    the branch that begins there is followed, to a target that may stand here, or for `points`
+    steps. A mode that a meridian or a half excludes takes the smallest model that has it: for m
+    waves the sector of 180/m degrees between two mirror planes, else a half, else the whole shell.
+    The next step goes on from there, in that model"""
     snap: SnapSection = SnapSection.model_construct()
     """How it is released"""
     branches: bool = False
@@ -89,14 +89,15 @@ class PathStep(Step):
         quantities = {
             target.quantity for key, target in cls.targets.items() if data.get(key) is not None
         }
-        control = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
+        is_bound = _is_to_instability(data.get("until"), data.get("then"))
+        control = "arc" if is_bound else "load"  # load control passes no fold
         return {**data, "control": control} if quantities == {"load"} else data
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
         """Check that `until: target` has one target that fits the control, and other ends none.
 
-        Exceptions are a bound beside `until: limit`, and the target of a branch that is followed.
+        Exceptions are a bound beside an instability, and the target of a branch that is followed.
         """
         targets, prescribed = self._given_targets, self.prescribed
         # keys of targets that the control reaches: arc length those of the load and of the
@@ -125,12 +126,7 @@ class PathStep(Step):
             raise ValueError(f"{' and '.join(targets)}: a branch has one target")
         if self.until == "zero" and targets:
             raise ValueError(f"{next(iter(targets))} is a target: it goes with until: target")
-        ends_at_bifurcation = self.until == "bifurcation" and not follows_branch
-        if ends_at_bifurcation and targets:
-            raise ValueError(
-                f"{next(iter(targets))} is a target: it goes with until: target or limit"
-            )
-        if self.until == "limit" and targets:
+        if _is_to_instability(self.until, self.then) and targets:
             self._refuse_unfit_bound(list(targets), fitting)
         self._refuse_unfit_end()
         return self
@@ -154,7 +150,7 @@ class PathStep(Step):
             raise ValueError("snap: goes with then: snap")
 
     def _refuse_unfit_bound(self, targets: list[str], fitting: list[str]) -> None:
-        """Check the target beside `until: limit`: it must be the end of the path.
+        """Check the target beside `until: limit` or `bifurcation`: the end of the path.
 
         Parameters
         ----------
@@ -171,8 +167,8 @@ class PathStep(Step):
         has_fitting_target = len(targets) == 1 and targets[0] in fitting
         if self.prescribed == "load" or not has_fitting_target:
             raise ValueError(
-                f"{' and '.join(targets)}: beside until: limit stands one target, the end of the "
-                "way, with control: arc"
+                f"{' and '.join(targets)}: beside until: {self.until} stands one target, the end "
+                "of the way, with control: arc"
             )
 
     @classmethod
@@ -222,7 +218,7 @@ class PathStep(Step):
     def _target(self) -> tuple[Target, float] | None:
         """The target at which the path ends, and its value in the unit of its key; None without.
 
-        A target beside `until: limit` does not count here: it is a bound.
+        A target beside an instability does not count here: it is a bound.
         """
         if self._bound:
             return None
@@ -234,8 +230,8 @@ class PathStep(Step):
 
     @property
     def _bound(self) -> tuple[Target, float] | None:
-        """The latest end of the path with `until: limit`, and its direction; None without."""
-        if self.until != "limit":
+        """The latest end of a path to an instability, and its direction; None without."""
+        if not _is_to_instability(self.until, self.then):
             return None
         return next(
             ((self.targets[key], value) for key, value in self._given_targets.items()), None
@@ -312,6 +308,14 @@ class PathStep(Step):
     def scale(self, load_start: LoadStart) -> float:
         """Return a value of the amplitude that counts as of order one in the arc length."""
         return 1.0
+
+
+def _is_to_instability(until: str | None, then: str | None) -> bool:
+    """Return whether a path ends at an instability, and its target is the end of the way there.
+
+    A target beside a branch that is followed is the end of the branch.
+    """
+    return until == "limit" or (until == "bifurcation" and then != "follow")
 
 
 class LoadStep(PathStep):

@@ -36,7 +36,11 @@ Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Heights = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=2, max_length=2)]
 Azimuth = Annotated[
-    Range | None, Field(description="First and last, of a part; closed without [degree]")
+    Range | None,
+    Field(
+        description="First and last, of a part, whose edges there are left and right; closed "
+        "without [degree]"
+    ),
 ]
 FULL_TURN = [0.0, 360.0]  # degree
 TUBE_SAMPLES = 721  # angles of the section of a tube

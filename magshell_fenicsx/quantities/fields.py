@@ -3,7 +3,8 @@
 The numbers of files, and of a case without units, are over the unit of each field. E_1, E_2, M_1,
 M_2 are principal values of membrane strain and bending moment. F B^r is the remanence as the shell
 carries it, B^a the applied field; magnetic loads are those of a uniform field. A hat marks a vector
-over its largest length.
+over its largest length. Couples and springs are over the thickness at their place, so that they
+have no unit where it varies.
 """
 
 from collections.abc import Sequence
@@ -20,12 +21,14 @@ from magshell_fenicsx.quantities.quantity import (
 )
 from magshell_fenicsx.quantities.stresses import BENDING_MOMENT, STRESS
 
-COUPLE = Unit("h E λ_m", "N/m", "N_per_m", "N/m", lambda g: g.E * g.h * g.largest_field, symbol="")
+COUPLE = Unit(
+    "h E λ_m", "N/m", "N_per_m", "N/m", lambda g: g.force_per_length * g.largest_field, symbol=""
+)
 MAGNETIC_PRESSURE = Unit("E λ_m", "Pa", "Pa", "Pa", lambda g: g.E * g.lambda_m)
-SPRINGS = Unit("h E λ_m", "N/m", "N_per_m", "N/m", lambda g: g.E * g.h * g.lambda_m)
+SPRINGS = Unit("h E λ_m", "N/m", "N_per_m", "N/m", lambda g: g.force_per_length * g.lambda_m)
 # of vectors, whose length is drawn
 IN_PLANE_FORCE = replace(MAGNETIC_PRESSURE, size=lambda g: g.E * abs(g.lambda_m))
-TORQUE = replace(SPRINGS, size=lambda g: g.E * g.h * abs(g.lambda_m))
+TORQUE = replace(SPRINGS, size=lambda g: g.force_per_length * abs(g.lambda_m))
 
 
 def _field(name: str, words: str, symbol: str = "", *units: Unit) -> Quantity:

@@ -52,6 +52,8 @@ class CaseSizes:
         for one that has turned.
     largest_field
         Its largest magnitude on the shell there.
+    has_one_thickness
+        Whether the thickness is h everywhere.
     """
 
     nu: float
@@ -64,6 +66,7 @@ class CaseSizes:
     second: float = nan
     lambda_m: float = nan
     largest_field: float = nan
+    has_one_thickness: bool = True
 
     @property
     def h(self) -> float:
@@ -79,6 +82,11 @@ class CaseSizes:
     def moment(self) -> float:
         """The unit D/R of moments per length (N)."""
         return self.force / (2 * pi)
+
+    @property
+    def force_per_length(self) -> float:
+        """The unit E h of forces per length (N/m); nan where the thickness varies."""
+        return self.E * self.h if self.has_one_thickness else nan
 
     @property
     def in_si(self) -> float:

@@ -8,7 +8,9 @@ parameter. Lengths are over R, the reference length; h is the thickness, D the b
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from math import nan
 from select import select
 from shutil import which
 from subprocess import DEVNULL, PIPE, Popen
@@ -23,6 +25,7 @@ from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import PICTURES, figures
 from magshell_fenicsx.output.pictures.rendering import run_camera
 from magshell_fenicsx.output.store.stored_results import pole_of
+from magshell_fenicsx.parts.magnetism.fields import FIELD
 from magshell_fenicsx.quantities.quantity import NO_UNITS
 from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.runs.rows import rows
@@ -146,11 +149,15 @@ def picture(
     """
     if of not in PICTURES:
         raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
-    shell, (row,) = surface(scene, record), rows(scene, [record])
+    shell = surface(scene, record)
     if shell is None:
         return None
     style, camera = scene.problem.output, run_camera(shell, scene.problem.output)
-    sizes = sizes_at(scene.sizes.case or NO_UNITS, shell, row)
+    has_one_thickness = scene.model.thickness is None
+    sizes = replace(scene.sizes.case or NO_UNITS, has_one_thickness=has_one_thickness)
+    mu = record.point.state.mu
+    is_turned = any(mu.get(name) for name in FIELD.components)
+    sizes = sizes_at(sizes, shell, nan if is_turned else mu.get(FIELD.name, nan))
     pictures = figures(shell, scene.problem.material.h, style, camera, [of], sizes)
     return _in_line(pictures[of]) if pictures else None
 

@@ -277,6 +277,8 @@ class RunProgress:
 
     @property
     def _snaps(self) -> bool:
-        """Whether the step has reached its fold, where `then: snap` releases the shell."""
-        released = self._row.get("label") == "fold" or self._row.get("amplitude") == "time"
-        return released and getattr(self._load, "then", None) == "snap"
+        """Whether the step has reached the instability where `then: snap` releases the shell."""
+        if getattr(self._load, "then", None) != "snap":
+            return False
+        begin = "bifurcation" if self._load.until == "bifurcation" else "fold"
+        return self._row.get("label") == begin or self._row.get("amplitude") == "time"

@@ -76,6 +76,11 @@ def follow(
     """
     scene.read_functions()
     state, steps = scene.unloaded(), scene.problem.programme
+    if any(getattr(step.load, "event", None) for step in steps):
+        # steps at rest do without
+        from magshell_fenicsx.simulate.transient import refuse_unknown_events
+
+        refuse_unknown_events(scene, state)
     # energies that are there before any load, and rise from zero first
     energies = energies_moving_the_shell(scene, state)
     state = replace(state, mu=state.mu | dict.fromkeys(energies, 0.0))
@@ -91,9 +96,10 @@ def follow(
         try:
             yield from run.path(state)
             if step.load.end.bound and not run.is_unstable:
+                event = "instability" if step.until == "limit" else "bifurcation"
                 remark(
-                    f"{run.place}there is no instability up to the target, where until: limit ends "
-                    "too"
+                    f"{run.place}there is no {event} up to the target, where until: {step.until} "
+                    "ends too"
                 )
             if text := run.remark_on_release():
                 remark(run.place + text)

@@ -63,9 +63,9 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 # load at which a path ends, over that of the first excluded instability
 MAX_RATIO_TO_EXCLUDED = 2.0
 LOCATED = ("fold", "bifurcation")
-TINY_STEP = 1e-4  # over the longest step of a path
+TINY_STEP = 1e-3  # over the way of a path
 TINY_STEPS = 15  # successive tiny steps after which a path in contact is said to creep
-RESOLVING_SIZE = 0.4  # of elements that resolve a contact, over sqrt(R h)
+RESOLVING_SIZE = 0.25  # of elements that resolve a contact, over sqrt(R h)
 MAX_CONTACT_CHANGES = 10  # times that a first point gets stiffer penalties or new cuts
 FIRST_STEP_REDUCTION = (
     1 / 16
@@ -433,21 +433,26 @@ class _StageRecords:
         if label == "fold":
             value = amount(stage.scene, path.name, point.state.mu[path.name])
             self._fold_text = f"; the last fold is at {value}"
-        remark = cluster_remark(stage.scene, run, point) or self._remark_on_tiny_steps(path, point)
+        remark = cluster_remark(stage.scene, run, point) or self._remark_on_tiny_steps(run, point)
         unstable = self._monitor.unstable
         return Record(label, path.name, point, mode, excluded_pivots=unstable, said=remark)
 
-    def _remark_on_tiny_steps(self, path: Path, point: Point) -> str:
+    def _remark_on_tiny_steps(self, run: ContinuationRun, point: Point) -> str:
         """Return a remark on a path that creeps since something touches; else "".
 
-        It stands once, at the point where so many steps were tiny.
+        It stands once, at the point where so many steps were tiny against the way of the run: so
+        far, or up to its target where that is a value of s.
         """
-        earlier, tiny = self._tiny_steps, TINY_STEP * path.options.largest
+        earlier, begin = self._tiny_steps, run.points[0].s
+        ends = [point.s] if run.path.control == "arc" else [point.s, *run.goal.targets[-1:]]
+        tiny = TINY_STEP * max(abs(end - begin) for end in ends)
         is_tiny = bool(earlier) and abs(point.s - earlier[-1].s) < tiny
         self._tiny_steps = [*earlier, point] if is_tiny else [point]
         if len(self._tiny_steps) != TINY_STEPS + 1 or not self._stage.scene.model.all_contacts:
             return ""
-        return creeping_remark(self._stage.scene)
+        remark = creeping_remark(self._stage.scene)
+        is_load_by_arc = run.path.control == "arc" and not run.path.name.startswith("approach")
+        return f"{remark}; or control: load" if is_load_by_arc else remark
 
     def _reason(self, path: Path, records_ahead: Sequence[Record]) -> str:
         """Return the reason why the path has stopped, in words; "" if it has reached its goal.
@@ -815,13 +820,15 @@ def creeping_remark(scene: Scene) -> str:
     size = RESOLVING_SIZE * np.sqrt(h) * problem.length
     if given_size:
         size = min(size, given_size / 2)
-    unit, text = scene.sizes.column("w_over_h"), f"{size:.2g}"
+    unit, way_on = scene.sizes.column("w_over_h"), f"mesh.size: {size:.2g}"
     if unit:  # w_over_h has the thickness as its unit
         measured = size / (h * problem.length) * scene.sizes.size("w_over_h")
-        text = f"{measured:.2g} {unit.si}"
+        way_on = f"mesh.size: {measured:.2g} {unit.si}"
+    if problem.axisymmetric:  # its elements are smaller than these
+        way_on = f"mesh.refinement: {2 * problem.mesh.refinement:g}"
     return (
         "the steps stay tiny where the shell touches something, most often since its elements are "
-        f"too large there: give mesh.size: {text}"
+        f"too large there: give {way_on}"
     )
 
 

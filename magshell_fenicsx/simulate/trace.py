@@ -142,8 +142,8 @@ def trace(  # noqa: PLR0913
         (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes
         folds of both.
     until
-        The end of the path: "limit" at the first instability or the last
-        target, "bifurcation", "target" at the last target, "points" after `steps` steps.
+        The end of the path: "limit" at the first instability or the last target, "bifurcation" at
+        the first bifurcation or there, "target" there, "points" after `steps` steps.
     targets
         Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers,
         or text with a unit such as "100 Pa" where the case has units; -Pi_i(u) is then the change

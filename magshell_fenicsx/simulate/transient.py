@@ -108,7 +108,7 @@ def motion_records(
     steps = _time_steps(scene, load)
     energies = _Energies(scene, integrator, motion)
     row_times = [duration * i / load.points for i in range(1, load.points + 1)]
-    end_of_motion = _MotionEnd(load, integrator, _event_function(scene, load.event, state))
+    end_of_motion = _MotionEnd(load, integrator, _event_function(scene, load.event))
     marks = start.loads.marks
     refinement = None
     if load.errors == "motion" and steps.fixed is None:  # coarser runs show the error at the rows
@@ -450,34 +450,38 @@ def _excluded_pivots(scene: Scene, state: State) -> int:
     return unstable_count(scene.model.symmetry_breaking_modes, state)
 
 
-def _event_function(
-    scene: Scene, event: EventSection | None, state: State
-) -> Callable[[Motion], float] | None:
+def refuse_unknown_events(scene: Scene, state: State) -> None:
+    """Raise CaseError if a step in time ends at an event of an unknown column; collective.
+
+    Any state of the scene shows which columns there are.
+    """
+    for step in scene.problem.programme:
+        event = step.load.event if isinstance(step.load, TimeSection) else None
+        if event and event.column not in (columns := _columns_of_events(scene, state)):
+            raise CaseError(
+                f"{step.key}.event.column: {event.column}: no such column; allowed: "
+                f"{', '.join(columns)}"
+            )
+
+
+def _columns_of_events(scene: Scene, state: State) -> dict[str, float]:
+    """Return column of path.csv, also those in the case's units -> its value at a state."""
+    columns = scene.observe(state)
+    return columns | scene.sizes.values(columns)
+
+
+def _event_function(scene: Scene, event: EventSection | None) -> Callable[[Motion], float] | None:
     """Return the function of a motion that changes its sign at an event; None without an event.
 
     It is the excess of a column over the value of the event.
-
-    Parameters
-    ----------
-    state
-        Any state of the scene: it shows which columns there are.
-
-    Raises
-    ------
-    CaseError
-        If there is no such column.
     """
     if event is None:
         return None
-    if event.column not in (columns := scene.observe(state)):
-        raise CaseError(
-            f"loading: event.column: {event.column}: no such column; allowed: {', '.join(columns)}"
-        )
 
     def excess(motion: Motion) -> float:
         """Return the column at a motion less the value of the event; collective."""
         moved_state = scene.model.system.with_moved_supports(State(motion.u, motion.mu))
-        return scene.observe(moved_state)[event.column] - event.value
+        return _columns_of_events(scene, moved_state)[event.column] - event.value
 
     return excess
 

@@ -92,6 +92,7 @@ class Outcome:
             "barrier": self.barrier,
             "limit_points": [self.limit] if self.limit else [],
             "snaps": self.snaps,
+            "in_units": self.in_units,
         }
         # rows as texts, as in path.csv
         rows = [_texts_of(row) for row in self.curve]

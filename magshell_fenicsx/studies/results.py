@@ -18,12 +18,15 @@ from scipy.interpolate import barycentric_interpolate
 import magshell_fenicsx.parts.registered  # noqa: F401  the columns of parts are in the registry
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, is_column_of_numbers
+from magshell_fenicsx.runs.summary import IN_UNITS
 
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", *OF_SNAPS)
+IN_SUMMARY_IN_UNITS = tuple(sorted(set[str]().union(*IN_UNITS.values())))  # of a case with units
 FREQUENCY = re.compile(r"(omega2|hertz)_[1-9]\d*")
 FORMS = (
-    f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+    f"write {', '.join((*IN_SUMMARY, *IN_SUMMARY_IN_UNITS))}, COLUMN@COLUMN=VALUE or COLUMN@end, "
+    "with columns of path.csv"
 )
 
 
@@ -60,6 +63,8 @@ class Scalar:
         summary, rows
             The content of summary.json and of path.csv.
         """
+        if self.name in IN_SUMMARY_IN_UNITS:
+            return _number((summary.get("in_units") or {}).get(self.name))
         if self.name in ("knockdown", "barrier"):
             return _number(summary[self.name])
         if self.name == "critical_field":
@@ -131,7 +136,7 @@ def parse_scalar(text: str, *, with_frequencies: bool = False) -> Scalar:
     >>> parse_scalar("force@w_over_h=10")
     Scalar(name='force@w_over_h=10', column='force', at='w_over_h', value=10.0)
     """
-    if text in IN_SUMMARY:
+    if text in (*IN_SUMMARY, *IN_SUMMARY_IN_UNITS):
         return Scalar(text)
     column, _, place = text.partition("@")
     place_column, _, number = place.partition("=")

@@ -30,6 +30,7 @@ from magshell_fenicsx.output.fields.vtu import (
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import (
     ColouredField,
+    field_at,
     field_caption,
     loads,
     moments,
@@ -458,7 +459,7 @@ def test_bars_have_the_units_of_a_case() -> None:
     }
     surface = replace(plate(0.1), fields=fields)
     row: Row = {"lambda_m": -0.01, "field_angle": 0.0}
-    found = bars(surface, sizes_at(sizes, surface, row))
+    found = bars(surface, sizes_at(sizes, surface, field_at(row)))
     stiffness = 1.2e6 * 0.2e-3**3 / (12 * 0.75)
     moment = f"{1e6 * 2.5 * stiffness / 0.02:.3g}"  # of the colours' limit, without a peak
     assert {caption: (texts[0], texts[-1]) for caption, texts in found.items()} == {
@@ -471,10 +472,16 @@ def test_bars_have_the_units_of_a_case() -> None:
         "couple  (N/m)": ("0", "2.4"),
         "magnetic pressure  $p_\\mathrm{mag}$  (kPa)": ("−36", "0"),
     }
-    # what has no unit in a field that has turned, or without a modulus, is over its own
-    turned = sizes_at(sizes, surface, row | {"field_angle": 30.0})
+    # what has no unit in a field that has turned, in an uneven shell, or without a modulus, is over
+    # its own
+    turned = sizes_at(sizes, surface, field_at(row | {"field_angle": 30.0}))
     captions = bars(surface, turned, "magnetic_loads")
     assert list(captions) == ["couple  (N/m)", field_caption("p_mag")]
+    uneven = sizes_at(replace(sizes, has_one_thickness=False), surface, field_at(row))
+    assert list(bars(surface, uneven, "magnetic_loads")) == [
+        field_caption("couple"),
+        "magnetic pressure  $p_\\mathrm{mag}$  (kPa)",
+    ]
     without_modulus = bars(surface, replace(sizes, E=nan), "shell", "moments")
     assert list(without_modulus)[1:] == [field_caption("M_1"), field_caption("M_2")]
     assert "inward normal displacement  $w$  (mm)" in without_modulus

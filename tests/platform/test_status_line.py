@@ -255,9 +255,19 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
-def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the fold on, where it may be rehearsed for minutes, it is called what it is."""
-    case = Case.load(CASES / "dimple_buckling.yaml", ["loading.then=snap", "magnetic=null"])
+@pytest.mark.parametrize(
+    ("until", "labels", "goal"),
+    [
+        ("limit", ("step", "fold"), "instability"),
+        ("bifurcation", ("fold", "bifurcation"), "bifurcation"),  # past a fold
+    ],
+)
+def test_a_snap_is_no_search_for_an_instability(
+    until: str, labels: tuple[str, str], goal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From its instability on, where it may be rehearsed for minutes, it is called what it is."""
+    changes = [f"loading.until={until}", "loading.then=snap", "magnetic=null"]
+    case = Case.load(CASES / "dimple_buckling.yaml", changes)
     told: list[str] = []
     monkeypatch.setattr(time, "perf_counter", lambda: 0.0)
     model = SimpleNamespace(contacts={})
@@ -268,13 +278,13 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
     progress = RunProgress(scene, told.append, 0.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     progress.beginning(1)
-    for label in ("step", "fold"):
+    for label in labels:
         progress.accepted(
             {"label": label, "amplitude": "pressure", "p_over_pc": 0.3}, is_known=False
         )
         progress.trying(here, 0.02)  # type: ignore[arg-type]
     assert told == [
-        "1 point  p/pc 0.3 -> the first instability  0:00  du/h 1",
+        f"1 point  p/pc 0.3 -> the first {goal}  0:00  du/h 1",
         "2 points  the snap  0:00  du/h 1",
     ]
 

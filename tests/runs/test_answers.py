@@ -4,6 +4,7 @@ headline names.
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +14,6 @@ import pytest
 from command import magshell, read_path
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice
@@ -243,17 +243,29 @@ def test_snap_onto_a_shell_is_told_before() -> None:
 
 def test_creeping_contact_is_told() -> None:
     """Once, after enough tiny steps, with a size of elements in the case's unit."""
-    bodies = {"plate": {"kind": "plane"}}
-    scene = Scene(Case.from_source(in_units(22, "0.5 mm", bodies=bodies, mesh=MESH)))
+    data = in_units(22, "0.5 mm", bodies={"plate": {"kind": "plane"}}, mesh=MESH)
+    scene = Scene(Case.from_source(data | {"symmetry": "half"}))
     records = object.__new__(_StageRecords)
-    records._stage, records._tiny_steps = SimpleNamespace(scene=scene), []  # type: ignore[assignment]
-    path = SimpleNamespace(options=StepOptions(1.0, 2.0, 1e-5))
+    records._stage = SimpleNamespace(scene=scene)  # type: ignore[assignment]
     steps = [0, 1, *(1 + 1e-6 * np.arange(1, 2 * TINY_STEPS))]
-    said = [
-        records._remark_on_tiny_steps(path, SimpleNamespace(s=s))  # type: ignore[arg-type]
-        for s in steps
-    ]
+
+    def said_on(steps: Sequence[float], control: str, *targets: float) -> list[str]:
+        """What is said at each of these values of s."""
+        records._tiny_steps = []
+        points = [SimpleNamespace(s=s) for s in steps]
+        path, goal = SimpleNamespace(control=control), SimpleNamespace(targets=targets)
+        course = SimpleNamespace(points=points, path=path, goal=goal)
+        return [
+            records._remark_on_tiny_steps(course, point)  # type: ignore[arg-type]
+            for point in points
+        ]
+
+    said = said_on(steps, "arc")
+    even = np.linspace(0, 1, 40)
+    assert not any(said_on(even, "arc"))
+    assert any(said_on(1e-6 * even, "load", 1.0))
     assert [bool(text) for text in said].index(True) == 1 + TINY_STEPS
-    size = 0.4 * np.sqrt(30 * 0.5)
+    size = 0.25 * np.sqrt(30 * 0.5)
     assert [text for text in said if text] == [creeping_remark(scene)]
     assert creeping_remark(scene).endswith(f"mesh.size: {size:.2g} mm")
+    assert creeping_remark(Scene(Case.from_source(data))).endswith("mesh.refinement: 1.4")

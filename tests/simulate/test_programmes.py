@@ -293,15 +293,20 @@ def test_first_instability_on_the_way_to_a_target() -> None:
         ]
         critical.append(scene.observe(records[-1].point.state)["lambda_m"])
     assert critical[0] == pytest.approx(critical[1], rel=1e-8)
-    near = case(
-        {**load, "factor": -1}, shell=dome, boundary={"rim": "hinged"}, magnetic={"lambda_m": 0.01}
-    )
-    said = list[str]()
-    *_, last = follow(Scene(near), remark=said.append)
-    assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
-    assert said == [
-        "step 1 of 1 (field): there is no instability up to the target, where until: limit ends too"
-    ]
+    for until, event in (("limit", "instability"), ("bifurcation", "bifurcation")):
+        near = case(
+            {**load, "until": until, "factor": -1},
+            shell=dome,
+            boundary={"rim": "hinged"},
+            magnetic={"lambda_m": 0.01},
+        )
+        said = list[str]()
+        *_, last = follow(Scene(near), remark=said.append)
+        assert (last.label, last.point.state.mu["lambda_m"]) == ("target", pytest.approx(-0.01))
+        assert said == [
+            f"step 1 of 1 (field): there is no {event} up to the target, where until: {until} ends "
+            "too"
+        ]
 
 
 def test_a_way_that_ends_before_the_first_contact_ends_there() -> None:
@@ -321,12 +326,12 @@ def test_a_way_that_ends_before_the_first_contact_ends_there() -> None:
     ("step", "message"),
     [
         (
-            {"until": "bifurcation", "factor": -3},
-            "loading.0: factor is a target: it goes with until: target or limit",
-        ),
-        (
             {"until": "limit", "factor": -3, "control": "load"},
             "factor: beside until: limit stands one target",
+        ),
+        (
+            {"until": "bifurcation", "factor": -3, "control": "load"},
+            "factor: beside until: bifurcation stands one target",
         ),
         ({"until": "limit", "factor": 0}, "the target must not be zero"),
     ],

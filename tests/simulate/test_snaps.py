@@ -179,3 +179,11 @@ def test_departure_and_jump(late: float) -> None:
         "The snap takes 3.1 ms from 10 to 90 % of its way, "
         "after a departure from the fold of 28 ms."
     )
+    steps = [{"snap": {"damping": 0.1}}, {"snap": {"damping": 0.2}}]
+    lines = [{"point": "0", "step": "2"}]
+    (with_damping,) = _snaps({"snaps": [snap], "case": {"loading": steps}}, lines)
+    assert " of its way with the damping 0.2 of snap, after" in with_damping
+    lines.append({"point": str(snap["rest"]), "ball_normal_force": "0.0", "contact_force": "2e-3"})
+    touching = {"bodies": {"ball": {}}, "shells": {"upper": {}, "lower": {}}}
+    *_, touched = _snaps({"snaps": [snap], "case": touching}, lines)
+    assert touched == "It comes to rest on another shell."

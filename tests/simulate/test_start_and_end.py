@@ -10,7 +10,8 @@ import pytest
 from test_in_time import BEAM, PLATE, STRIP, case_of, columns_of
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.public import run
+from magshell_fenicsx.public import Scene, run
+from magshell_fenicsx.simulate.transient import refuse_unknown_events
 
 QUARTIC = ["0", "0", "(1 - x**2 - y**2)**2"]
 
@@ -114,10 +115,27 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"until": "event"}, "event: goes with until: event, which needs one"),
     (
         {"until": "event", "event": {"column": "weight", "value": 1.0}},
-        "event.column: weight: no such column",
+        "loading.0.event.column: weight: no such column",
     ),
     ({"velocity": ["t", "0", "0"]}, "velocity"),
 ]
+
+
+def test_event_in_units() -> None:
+    """A column in the case's units may end a step, and an unknown one is refused before any."""
+    shell = {
+        "geometry": "disc",
+        "radius": "10 mm",
+        "thickness": "0.2 mm",
+        "youngs_modulus": "1 MPa",
+        "poisson_ratio": 0.3,
+        "density": "1000 kg/m^3",
+    }
+    step = {"kind": "time", "duration": "1 ms", "velocity": ["0", "0", "1"], "until": "event"}
+    scene = Scene(
+        case_of({**PLATE, "shell": shell}, step | {"event": {"column": "w_mm", "value": 1}})
+    )
+    refuse_unknown_events(scene, scene.unloaded())
 
 
 @pytest.mark.parametrize(("given", "message"), MISTAKES)

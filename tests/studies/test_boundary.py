@@ -20,10 +20,13 @@ from scipy.optimize import brentq
 from scipy.special import jv, jvp
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx import Case
+from magshell_fenicsx.case.planner import document_of
+from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.scene_cache import problem_on_moved_mesh
 from magshell_fenicsx.studies.boundary.picture import _regions, draw_map
+from magshell_fenicsx.studies.boundary.start import with_texts
 
 
 def saved_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
@@ -234,6 +237,17 @@ def test_another_branch_from_a_point_of_a_run(tmp_path: Path) -> None:
 
 class Killed(Exception):
     pass
+
+
+def test_a_stored_case_has_its_units_again() -> None:
+    """A run stores 0.09 for 90 mT, and the case of the run is one with units still."""
+    source = read_source(CASES / "bistable_dome.yaml")
+    stored = document_of(Case.from_source(source)).data | {"reactions": True}
+    stored["shell"] |= {"polar": 30}
+    data = with_texts(stored, document_of(Case.from_source(source)).data, source.data)
+    assert data["magnetic"]["remanent"]["flux_density"] == "90 mT"
+    assert (data["shell"]["radius"], data["shell"]["polar"]) == ("10 mm", 30)
+    assert document_of(Case.from_source(data)).data == stored
 
 
 @pytest.mark.slow

@@ -101,6 +101,9 @@ def test_results_of_the_summary() -> None:
     ]
     assert of_snaps == [2.0, None, None]
     assert Scalar("snap_jump").value_in({"snaps": []}, []) is None
+    in_units = parse_scalar("critical_field_mT")
+    assert in_units.value_in({"in_units": {"critical_field_mT": -400.0}}, []) == -400.0
+    assert in_units.value_in({"in_units": {}}, []) is None
 
 
 @pytest.mark.parametrize(

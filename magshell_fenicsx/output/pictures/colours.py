@@ -141,15 +141,19 @@ def in_units(field: ColouredField, sizes: CaseSizes) -> ColouredField:
     )
 
 
-def sizes_at(sizes: CaseSizes, surface: Surface, row: Row) -> CaseSizes:
-    """Return the sizes of a case with the magnetic field at the point of a row of path.csv.
+def field_at(row: Row) -> float:
+    """Return the field λ_m at the point of a row of path.csv; nan of one that has turned.
 
-    The loads of a field that has turned are not those of the state: their unit is unknown.
+    The magnetic loads are those of a field in its first direction.
     """
+    return nan if row["field_angle"] else float(row["lambda_m"])
+
+
+def sizes_at(sizes: CaseSizes, surface: Surface, lambda_m: float) -> CaseSizes:
+    """Return the sizes of a case with the magnetic field λ_m at the state of a surface."""
     if "Ba" not in surface.fields:
         return sizes
     largest = float(np.nan_to_num(np.linalg.norm(surface.fields["Ba"], axis=1)).max())
-    lambda_m = nan if row["field_angle"] else float(row["lambda_m"])
     return replace(sizes, lambda_m=lambda_m, largest_field=largest)
 
 

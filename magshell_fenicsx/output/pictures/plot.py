@@ -29,7 +29,7 @@ from magshell_fenicsx.output.fields.vtu import (
 )
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.colours import sizes_at
+from magshell_fenicsx.output.pictures.colours import field_at, sizes_at
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_panels, frequencies_figure
 from magshell_fenicsx.output.pictures.curve_additions import add_shapes, runs_figure
 from magshell_fenicsx.output.pictures.error_band import errors_at_points
@@ -302,7 +302,7 @@ def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, byte
         shell_data.h,
         run.style,
         run.camera,
-        sizes=sizes_at(run.sizes, surface, run.rows[point]),
+        sizes=sizes_at(run.sizes, surface, field_at(run.rows[point])),
     )
     for name, figure in drawn.items():
         yield from figure_files(figure, run.style, f"{name}_{point:04d}")
@@ -344,7 +344,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     # of the shell at one point, and of the field around it
     shown_surface = without_zero_fields(surface, run.headline, run.rows)
     shown_surface = with_contact_errors(shown_surface, run)
-    sizes = sizes_at(run.sizes, surface, run.headline)
+    sizes = sizes_at(run.sizes, surface, field_at(run.headline))
     drawn = figures(shown_surface, shell_data.h, style, run.camera, sizes=sizes)
     for name, figure in drawn.items():
         yield from figure_files(figure, style, name)

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import SHELL, Surface, on_nodes_of
 from magshell_fenicsx.output.fields.tessellation import Tessellation, tessellate
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
-from magshell_fenicsx.output.pictures.colours import WITH_SIGN, couple, sizes_at
+from magshell_fenicsx.output.pictures.colours import WITH_SIGN, couple, field_at, sizes_at
 from magshell_fenicsx.output.pictures.lines import (
     SEGMENTS_PER_INTERVAL,
     CurveStep,
@@ -229,7 +229,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     for row in frames:
         deformed, _ = read_point(fields, int(row["point"]))
         surfaces_on_nodes.append(on_nodes_of(deformed, surface))
-        sizes.append(sizes_at(case_sizes, deformed, row))
+        sizes.append(sizes_at(case_sizes, deformed, field_at(row)))
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {

@@ -361,7 +361,7 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         )
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
-    sentences += _snaps(summary)
+    sentences += _snaps(summary, lines)
     sentences += _error(summary)
     sentences += [
         Markup("{}.").format(remark[0].upper() + remark[1:])
@@ -375,11 +375,12 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     return Markup(" ").join(sentences)
 
 
-def _snaps(summary: Summary) -> list[Markup]:
+def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
     """Return a list with one sentence on the first snap; empty without a snap.
 
-    The sentence says how long the snap takes from a tenth to nine tenths of its way after its
-    departure from the fold, and how far it goes beyond its end.
+    The sentence says how long the snap takes from a tenth to nine tenths of its way, with which
+    damping that the run has added, after its departure from the fold, and how far it goes beyond
+    its end. A second one says what touches where it comes to rest.
     """
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
@@ -400,9 +401,46 @@ def _snaps(summary: Summary) -> list[Markup]:
     if percent > MIN_OVERSHOOT:
         overshoot = Markup(", and overshoots by {} % of its way").format(number(percent, digits=2))
     words = (
-        "The snap takes {} from 10 to 90 % of its way, after a departure from the fold of {}{}{}."
+        "The snap takes {} from 10 to 90 % of its way{}, after a departure from the fold of {}{}{}."
     )
-    return [Markup(words).format(*times, unit, overshoot)]
+    jump, departure = times
+    damping = _damping_of_snap(summary, lines)
+    sentences = [Markup(words).format(jump, damping, departure, unit, overshoot)]
+    if touched := _touched_at_rest(summary, lines):
+        sentences.append(Markup("It comes to rest on {}.").format(" and ".join(touched)))
+    return sentences
+
+
+def _touched_at_rest(summary: Summary, lines: Sequence[Line]) -> list[str]:
+    """Return what touches where the first snap comes to rest, in words: bodies, and shells."""
+    rest = _line_at(summary["snaps"][0].get("rest"), lines)
+    case = summary.get("case", {})
+    columns = {f"{name}_normal_force": name for name in case.get("bodies") or {}}
+    columns["contact_force"] = "another shell" if case.get("shells") else "itself"
+    return [
+        name
+        for column, name in columns.items()
+        if above_rounding(float(rest.get(column) or 0.0)) > 0
+    ]
+
+
+def _line_at(point: int | None, lines: Sequence[Line]) -> Line:
+    """Return the line of the point with a number; empty if there is none."""
+    return next((line for line in lines if int(line["point"]) == point), {})
+
+
+def _damping_of_snap(summary: Summary, lines: Sequence[Line]) -> Markup:
+    """Return words for the damping of the first snap, which slows it; empty if it is unknown."""
+    fold = _line_at(summary["snaps"][0].get("point"), lines)
+    loading = summary.get("case", {}).get("loading")
+    steps = loading if isinstance(loading, list) else [loading]
+    number_of_step = int(fold.get("step") or 0)
+    if not 1 <= number_of_step <= len(steps):
+        return Markup()
+    section = (steps[number_of_step - 1] or {}).get("snap") or {}
+    if "damping" not in section:  # of an earlier version
+        return Markup()
+    return Markup(" with the damping {} of snap").format(number(section["damping"]))
 
 
 def _error(summary: Summary) -> list[Markup]:

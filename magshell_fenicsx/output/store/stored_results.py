@@ -118,7 +118,17 @@ def sizes_in(folder: Path) -> CaseSizes:
         R_over_h=groups["radius_to_thickness"],
         R=nan if R is None else R,
         E=nan if E is None else E,
+        has_one_thickness=_has_one_thickness(summary["case"]),
     )
+
+
+def _has_one_thickness(case: Mapping[str, Any]) -> bool:
+    """Whether the thickness of a case's shell, or of all its shells, is the same everywhere."""
+    sections = [shell.get("shell", {}) for shell in (case.get("shells") or {}).values()]
+    sections.append(case.get("shell") or {})
+    thicknesses = {section["thickness"] for section in sections if "thickness" in section}
+    varies = any("thickness_factor" in section for section in sections)
+    return len(thicknesses) < 2 and not varies
 
 
 def _first_error(value: Any, types: Any, key: str = "") -> str:

@@ -54,7 +54,7 @@ class EventSection(Section):
     """A column of path.csv that comes to a value."""
 
     column: str
-    """Its name, such as w_over_h or middle_uz"""
+    """Its name, such as w_over_h, w_mm or middle_uz"""
     value: float
     """In the column's unit"""
 

@@ -209,8 +209,8 @@ def inflation_warning(context: Context, shell: str = "") -> str | None:
     return (
         f"boundary.{edges[0]}: clamped: blown-up rubber bends there in a layer as wide as it "
         "is thick, which no shell theory describes: instabilities may be false far beyond the "
-        "largest pressure, or with wider elements along this edge; hinged is right, and a "
-        "clamped edge raises the fold by less than h/R"
+        "largest pressure, or with wider elements along this edge; a hinged edge has no such "
+        "layer, and its fold is lower by less than h/R"
     )
 
 

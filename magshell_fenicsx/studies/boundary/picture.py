@@ -256,8 +256,8 @@ def _smoothed(places: Sequence[tuple[float, float]], located: Sequence[bool] = (
 
 
 def _title(content: Mapping[str, Any]) -> str:
-    """Return the name of the case, and its settings."""
-    return ", ".join([Path(content["case"]).stem.replace("_", " "), *content.get("settings", ())])
+    """Return the settings of the case."""
+    return ", ".join(content.get("settings", ()))
 
 
 def _arms(

@@ -6,12 +6,14 @@ parameter, by name.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isclose
 from pathlib import Path
 from typing import Any
 
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import document_of
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.stored_results import case_in
@@ -123,4 +125,33 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
     # the amplitude that varies there
     load = float(row[amplitude(row["amplitude"]).column])
     # places in the file, for messages, are not those of the stored case
+    data = with_texts(data, document_of(Case.from_source(source)).data, source.data)
     return Start(text, point, load), replace(source, data=data, places={})
+
+
+def with_texts(stored: Any, resolved: Any, written: Any) -> Any:
+    """Return a stored case with the texts of a case file, such as "90 mT" for 0.09.
+
+    Numbers of a stored case have lost their units. A value is the text of the file where both cases
+    have the same number, and else the stored one.
+
+    Parameters
+    ----------
+    stored
+        The case of a run, or a part of it.
+    resolved
+        The same part of the case in the file, as a run would store it.
+    written
+        The same part of the case as it is written in the file.
+    """
+    if isinstance(written, str) and stored == resolved:
+        return written
+    if all(isinstance(part, Mapping) for part in (stored, resolved, written)):
+        return {
+            key: with_texts(value, resolved.get(key), written.get(key))
+            for key, value in stored.items()
+        }
+    parts = stored, resolved, written
+    if all(isinstance(part, list) for part in parts) and len({len(part) for part in parts}) == 1:
+        return [with_texts(*items) for items in zip(*parts, strict=True)]
+    return stored

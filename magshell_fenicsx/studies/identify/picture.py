@@ -75,7 +75,6 @@ def draw_identified(
         plots = figure.subplots(1, len(panels), squeeze=False)[0]
         for plot, panel in zip(plots, panels, strict=True):
             panel(plot)
-        figure.suptitle(content["case"])
 
 
 def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:

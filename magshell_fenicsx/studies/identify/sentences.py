@@ -62,7 +62,8 @@ def _sentences_of_correlations(keys: list[str], posterior: Posterior) -> list[st
         if abs(correlation) > HIGH_CORRELATION:
             lines.append(
                 f"{keys[i]} and {keys[j]} can hardly be told apart by these data: correlation "
-                f"{correlation:+.4f}"
+                f"{correlation:+.4f}; data of a second field or load may, or a prior of one; "
+                "candidates says which data narrow them most"
             )
     return lines
 

@@ -489,8 +489,7 @@ def _write_points(
 ) -> None:
     """Write sweep.csv, a row for each point.
 
-    Values with units are columns of numbers too, and so are the results of a case with units. A
-    table with a requested number has no empty columns.
+    Values with units are columns of numbers too, and so are the results of a case with units.
 
     Parameters
     ----------
@@ -503,18 +502,16 @@ def _write_points(
         {**point_columns(axes, point), **sweep_row(outcome), **_in_units(outcome)}
         for point, outcome in outcomes_of_points
     ]
-    first_point, _ = outcomes_of_points[0]
-    first_columns = (*first_point.values, *FIRST_COLUMNS)
-    # the requested number comes first, under its name, and columns without a value are left out
+    # with the requested number, if there is one, also under its name, which tells its unit
     if results and scalar:
         rows = [
-            row | {scalar.name: value, f"{scalar.name}_error": outcome.error(scalar)}
+            row
+            | {"result": value, "result_error": (error := outcome.error(scalar))}
+            | {scalar.name: value, f"{scalar.name}_error": error}
             for row, value, (_, outcome) in zip(rows, results, outcomes_of_points, strict=True)
         ]
-        filled = {name for row in rows for name, value in row.items() if value not in (None, "")}
-        rows = [{name: row[name] for name in row if name in filled} for row in rows]
-        first_columns = (*first_point.values, scalar.name)
-    write_table(rows, file, first=first_columns)
+    first_point, _ = outcomes_of_points[0]
+    write_table(rows, file, first=(*first_point.values, *FIRST_COLUMNS))
 
 
 def _write_curves(outcomes_of_points: Sequence[tuple[SweepPoint, Outcome]], file: Path) -> None:
