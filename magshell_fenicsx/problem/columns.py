@@ -32,7 +32,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
     """
     sizes = sizes_of(problem.context, moment_columns(problem.loads))
     # nan: the case has no unit of length
-    if sizes.case is None or isnan(sizes.case.R):
+    if sizes.case_sizes is None or isnan(sizes.case_sizes.R):
         return sizes
     lengths, angles = dict[str, tuple[Unit, float]](), dict[str, tuple[Unit, float]]()
     for registered in OBSERVABLES:
@@ -40,7 +40,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
             if amount and is_rotation:
                 angles[name] = (TURN, float(np.degrees(amount)))
             elif amount:  # R in metres, the way in mm
-                lengths[name] = (DISTANCE, 1e3 * sizes.case.R * amount)
+                lengths[name] = (DISTANCE, 1e3 * sizes.case_sizes.R * amount)
     return replace(sizes, distances=lengths | angles)
 
 

@@ -464,7 +464,7 @@ class Sizes:
 
     Attributes
     ----------
-    case
+    case_sizes
         Sizes that the case has with units; None without.
     moments
         Columns of reactions that are moments.
@@ -472,7 +472,7 @@ class Sizes:
         Columns of motions -> the unit of their distance or angle, and its size.
     """
 
-    case: CaseSizes | None = None
+    case_sizes: CaseSizes | None = None
     moments: Collection[str] = ()
     distances: Mapping[str, tuple[Unit, float]] = field(default_factory=dict)
 
@@ -488,7 +488,7 @@ class Sizes:
 
     def _size(self, unit: Unit) -> float | None:
         """Return the size of a unit in this case; None if the case lacks it."""
-        size = unit.size(self.case) if self.case and unit.ending else nan
+        size = unit.size(self.case_sizes) if self.case_sizes and unit.ending else nan
         return None if isnan(size) else size
 
     def unit(self, name: str) -> Unit | None:

@@ -154,7 +154,7 @@ def picture(
         return None
     style, camera = scene.problem.output, run_camera(shell, scene.problem.output)
     has_one_thickness = scene.model.thickness is None
-    sizes = replace(scene.sizes.case or NO_UNITS, has_one_thickness=has_one_thickness)
+    sizes = replace(scene.sizes.case_sizes or NO_UNITS, has_one_thickness=has_one_thickness)
     mu = record.point.state.mu
     is_turned = any(mu.get(name) for name in FIELD.components)
     sizes = sizes_at(sizes, shell, nan if is_turned else mu.get(FIELD.name, nan))
