@@ -162,8 +162,9 @@ def test_a_tank_of_concrete() -> None:
     wall = "{geometry: cylinder, radius: 10 m, length: 8 m, thickness: 0.1 m, "
     material = "youngs_modulus: 30 GPa, poisson_ratio: 0.2}"
     points = "{foot: [10 m, 0, 0], wall: [10 m, 0, 4 m]}"
-    pressure = "loading.loads=[{over: all, pressure: '-9810*(8 - z)'}]"
-    settings = [f"shell={wall}{material}", f"points={points}", pressure]
+    loads = "[{over: all, pressure: '-9810*(8 - z)'}]"
+    loading = f"loading={{kind: dead, loads: {loads}, factor: 1, control: load, points: 1}}"
+    settings = [f"shell={wall}{material}", f"points={points}", loading]
     row = last_row(Case.load(CASES / "tank.yaml", settings))
     assert row["foot_M11_N"] == pytest.approx(20_904, rel=1e-3)
 

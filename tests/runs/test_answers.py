@@ -268,7 +268,7 @@ def test_creeping_contact_is_told() -> None:
     assert not any(said_on(even, "arc"))
     assert any(said_on(1e-6 * even, "load", 1.0))
     assert [bool(text) for text in said].index(True) == 1 + TINY_STEPS
-    size = 0.25 * np.sqrt(30 * 0.5)
+    size = 0.4 * np.sqrt(30 * 0.5)
     assert [text for text in said if text] == [creeping_remark(scene)]
     said_of_a_load = said_on(steps, "arc", name="pressure")
     assert [text for text in said_of_a_load if text] == [
