@@ -120,8 +120,8 @@ def contour_values(low: float, high: float) -> list[float]:
 
     Examples
     --------
-    >>> contour_values(-1.4, 20.0), contour_values(-0.2, 0.0)
-    ([5.0, 10.0, 15.0], [-0.15, -0.1, -0.05])
+    >>> contour_values(-1.4, 20.0), contour_values(-20.0, 0.0)
+    ([5.0, 10.0, 15.0], [-15.0, -10.0, -5.0])
     """
     from matplotlib.ticker import MaxNLocator
 
