@@ -679,10 +679,12 @@ def _mesh_plan(
     # the charts of places where other shells touch this one, in the model's frame
     charted_places = [
         replace(
-            touched,
-            place=chart_of(rotation(part.turn) @ touched.place, outline, half=part.is_symmetric),
+            contact_place,
+            place=chart_of(
+                rotation(part.turn) @ contact_place.place, outline, half=part.is_symmetric
+            ),
         )
-        for touched in contact_places
+        for contact_place in contact_places
     ]
     # squares in which formulas or spread imperfections need small elements, and the largest size
     varying, largest = _size_limits(case, shell, outline, part, formulas)

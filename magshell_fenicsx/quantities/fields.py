@@ -105,6 +105,6 @@ def in_case_unit_along_path(
         if unit.shown != unit.si:  # such as mm, which has a prefix
             return field.in_unit(unit), sizes
         largest = max(abs(size * value) for size, value in zip(sizes, values, strict=True))
-        factor, shown = with_prefix(largest, unit.si)
-        return field.in_unit(replace(unit, shown=shown)), [factor * size for size in sizes]
+        factor, prefixed_unit = with_prefix(largest, unit.si)
+        return field.in_unit(replace(unit, shown=prefixed_unit)), [factor * size for size in sizes]
     return field, [1.0] * len(states)

@@ -443,8 +443,8 @@ def _amount(value: float, unit: Unit, sizes: CaseSizes) -> str:
     size = unit.size(sizes)
     if isnan(size):
         return f"{value:.3g} ${unit.key.replace(' ', '')}$"
-    factor, shown = with_prefix(size * value, unit.si)
-    return f"{factor * size * value:.3g} {shown}"
+    factor, prefixed_unit = with_prefix(size * value, unit.si)
+    return f"{factor * size * value:.3g} {prefixed_unit}"
 
 
 def _error_text(relative_error: float) -> str:

@@ -60,7 +60,7 @@ PLACES_PER_SIDE = 9  # that are tried for a shell
 MARGIN = 0.02  # around these places, over the axes
 # costs of covering all of the curve, and another shell; a distance of one width of the axes costs 1
 COST_OF_CURVE, COST_OF_SHELL = 12.0, 50.0
-NARROW = 0.25  # width over length of a shell, seen from above, of which sections are drawn
+NARROW_RATIO = 0.25  # width over length of a shell, seen from above, of which sections are drawn
 TINY = 1e-300  # least divisor
 OPAQUE = 127  # of 255: pixels with a larger opacity belong to a shell
 
@@ -284,7 +284,7 @@ def _sections_of_strips(surfaces: Sequence[Surface]) -> list[UprightSection]:
     moves most tells the plane.
     """
     spread = np.linalg.svd(np.cov(surfaces[0].r0[:, :2].T), compute_uv=False)  # squares of lengths
-    if spread[1] > NARROW**2 * spread[0]:
+    if spread[1] > NARROW_RATIO**2 * spread[0]:
         return []
     section = upright_section(max(surfaces, key=lambda surface: float(np.abs(surface.u).max())))
     if section is None:
@@ -301,17 +301,17 @@ def _section_image(
     """
     from matplotlib.figure import Figure
 
-    boxes = np.array([each.box for each in sections])
-    left, low = boxes[:, [0, 2]].min(axis=0)
+    boxes = np.array([one_section.box for one_section in sections])
+    left_end, low = boxes[:, [0, 2]].min(axis=0)
     right, high = boxes[:, [1, 3]].max(axis=0)
     room = MAX_WIDTH * axes_size[0], MAX_HEIGHT * axes_size[1]
-    scale = min(room[0] / (right - left), room[1] / max(high - low, TINY))
-    width, height = (max(scale * size, 8.0) for size in (right - left, high - low))
+    scale = min(room[0] / (right - left_end), room[1] / max(high - low, TINY))
+    width, height = (max(scale * size, 8.0) for size in (right - left_end, high - low))
     figure = Figure(figsize=(width / STYLE.dpi, height / STYLE.dpi), dpi=STYLE.dpi)
     figure.patch.set_alpha(0.0)
     axes = figure.add_axes((0.02, 0.02, 0.96, 0.96))
     section.draw(axes)
-    axes.set(xlim=(left, right), ylim=(low, high))
+    axes.set(xlim=(left_end, right), ylim=(low, high))
     canvas = pixel_canvas(figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba())

@@ -63,7 +63,7 @@ DEPTH_TOLERANCE = 0.03  # over the shell's extent: depth at which places of arro
 ZERO_LOAD = 1e-4
 # over the largest displacements: distance of instabilities that are the same one
 SAME_INSTABILITY_TOLERANCE = 5e-3
-ALIKE = 0.04  # over the largest displacement: distance of solutions that look alike
+ALIKE_DISTANCE = 0.04  # over the largest displacement: distance of solutions that look alike
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -211,7 +211,7 @@ def solutions_figure(
         for earlier_row, earlier in zip(rows[:number], surfaces[:number], strict=True):
             difference = np.linalg.norm(surfaces[number].u - earlier.u, axis=1)
             distance = size * float(difference.max()) / h
-            if distance < ALIKE * abs(largest):
+            if distance < ALIKE_DISTANCE * abs(largest):
                 text = f"{in_mathematics(distance, 2)}{unit or ' $h$'}"
                 lines.append(f"at most {text} from {_name(earlier_row)}")
         captions.append("\n".join(lines))

@@ -300,14 +300,14 @@ def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, byte
     """Yield names and contents of the pictures of one point, named with its number."""
     surface, shell_data = run.surface_at(run.rows[point])
     shown_surface = without_zero_fields(surface, run.rows[point], run.rows)
-    drawn = figures(
+    figures_by_name = figures(
         shown_surface,
         shell_data.h,
         run.style,
         run.camera,
         sizes=sizes_at(run.sizes, surface, field_at(run.rows[point])),
     )
-    for name, figure in drawn.items():
+    for name, figure in figures_by_name.items():
         yield from figure_files(figure, run.style, f"{name}_{point:04d}")
     if maps := run.maps_at(run.rows[point]):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, run.style)
@@ -348,8 +348,8 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     shown_surface = without_zero_fields(surface, run.headline, run.rows)
     shown_surface = with_contact_errors(shown_surface, run)
     sizes = sizes_at(run.sizes, surface, field_at(run.headline))
-    drawn = figures(shown_surface, shell_data.h, style, run.camera, sizes=sizes)
-    for name, figure in drawn.items():
+    figures_by_name = figures(shown_surface, shell_data.h, style, run.camera, sizes=sizes)
+    for name, figure in figures_by_name.items():
         yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, style)

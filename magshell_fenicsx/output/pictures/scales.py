@@ -217,8 +217,8 @@ def _ticks(
         return abs(ticks[number] - ticks[end]) / (high - low) * length > least_distance
 
     inner = [i for i in range(1, len(ticks) - 1) if is_apart(i, 0) and is_apart(i, -1)]
-    shown = [0, *inner, len(ticks) - 1]
-    return [ticks[i] for i in shown], [texts[i] for i in shown], power
+    shown_ticks = [0, *inner, len(ticks) - 1]
+    return [ticks[i] for i in shown_ticks], [texts[i] for i in shown_ticks], power
 
 
 def _make_room_for_zero(

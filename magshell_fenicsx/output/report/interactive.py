@@ -487,12 +487,12 @@ def label(of_axis: Quantity, row: Row, pole: str, load: str = "") -> str:
     return _html_label(with_point_name(of_axis, row, pole))
 
 
-def _html_label(shown: Quantity) -> str:
+def _html_label(axis_quantity: Quantity) -> str:
     """Return words, symbol and unit of a quantity as HTML."""
-    words = f"{shown.words} {shown.note}".strip()
-    unit = f" ({shown.shown_unit})" if shown.shown_unit else ""
-    minus = "−" if shown.sign < 0 else ""
-    symbol = Markup(f" {minus}{shown.html}") if shown.symbol else ""
+    words = f"{axis_quantity.words} {axis_quantity.note}".strip()
+    unit = f" ({axis_quantity.shown_unit})" if axis_quantity.shown_unit else ""
+    minus = "−" if axis_quantity.sign < 0 else ""
+    symbol = Markup(f" {minus}{axis_quantity.html}") if axis_quantity.symbol else ""
     return str(Markup("{}{}{}").format(words, symbol, unit))
 
 

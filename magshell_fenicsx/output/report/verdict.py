@@ -409,8 +409,8 @@ def _snaps(summary: Summary, lines: Sequence[Line] = ()) -> list[Markup]:
     instability = "fold" if start.get("label", "fold") == "fold" else "bifurcation"
     damping = _damping_of_snap(summary, lines)
     sentences = [Markup(words).format(jump, damping, instability, departure, unit, overshoot)]
-    if touched := _touched_at_rest(summary, lines):
-        sentences.append(Markup("It comes to rest on {}.").format(" and ".join(touched)))
+    if things_touched := _touched_at_rest(summary, lines):
+        sentences.append(Markup("It comes to rest on {}.").format(" and ".join(things_touched)))
     return sentences
 
 
@@ -484,7 +484,7 @@ def _result_of_rounds(summary: Summary, lines: Sequence[Line]) -> str:
     to_target = last_step.get("until", "target") in ("target", "points", "zero")
     if not ends or not to_target or summary["stopped"]:
         return "the result"
-    results = [each["result"] for each in summary["tolerance"]["rounds"]]
+    results = [mesh_round["result"] for mesh_round in summary["tolerance"]["rounds"]]
 
     def is_result(line: Line) -> bool:
         """Whether a round of meshes has the load of a line as its result."""

@@ -275,12 +275,12 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     arrow_scale = ARROW * extent / longest
     right, vertical = arrow_scale * vectors[:, first], arrow_scale * vectors[:, second]
     min_distance = 0.0 if line_style else MIN_ARROW_DISTANCE * extent
-    shown = spread_points(places, min_distance) if min_distance else slice(None)
+    points_with_arrows = spread_points(places, min_distance) if min_distance else slice(None)
     axes.quiver(
-        horizontal[shown],
-        up[shown],
-        right[shown],
-        vertical[shown],
+        horizontal[points_with_arrows],
+        up[points_with_arrows],
+        right[points_with_arrows],
+        vertical[points_with_arrows],
         color="C3",
         width=0.006,
         angles="xy",
